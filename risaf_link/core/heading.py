@@ -1,0 +1,243 @@
+"""GPS fixes -> heading measurements with their variance."""
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from risaf_link.core.attitude import AttitudeState, Innovation
+from risaf_link.core.rotation import wrap
+
+EARTH_RADIUS = 6_371_008.8  # m, the mean radius of WGS 84
+RELATIVE_POSITION_NOISE = 0.1
+"""Noise between two consecutive positions as a share of the receiver's absolute accuracy: most of
+a receiver's position error changes within minutes, not between fixes."""
+
+
+class HeadingParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """How a heading is made from GPS fixes, and when it is believed."""
+
+    source: Literal["auto", "velocity", "positions", "positions_raw", "dual_antenna"] = "auto"
+    min_speed: Annotated[float, Meta(ge=0)] = 1.0
+    gate: Annotated[float, Meta(gt=0)] = 3.0
+    delay: Annotated[float, Meta(ge=0, le=1)] = 0.11
+    min_std: Annotated[float, Meta(gt=0)] = 0.02
+    timeout: Annotated[float, Meta(gt=0)] = 2.0
+    reset_after: Annotated[float, Meta(gt=0)] = 7.0
+
+
+class HeadingSource(IntEnum):
+    """What a heading was made from."""
+
+    NONE = 0
+    VELOCITY = 1
+    POSITIONS = 2
+    POSITIONS_RAW = 3
+    DUAL_ANTENNA = 4
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """One report of a GPS receiver. NaN: not known."""
+
+    time_us: int  # on the sender's clock; 0: not known
+    usable: bool  # the receiver itself calls it a 3D fix or better
+    latitude: float  # rad
+    longitude: float  # rad
+    speed: float  # m/s over ground
+    course: float  # rad from true north
+    yaw: float  # rad from true north, by two antennas
+    speed_std: float  # m/s
+    course_std: float  # rad, of course or yaw
+    position_std: float  # m, horizontal
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """One measurement of heading."""
+
+    heading: float  # rad from true north, in (-pi, pi]
+    variance: float  # rad^2
+    source: HeadingSource
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What one fix says about the vehicle's motion."""
+
+    speed: float  # m/s over ground, NaN: not known
+    heading: Heading | None  # None: too slow, or nothing to make it from
+
+
+class HeadingFinder:
+    """Makes headings from fixes, one after another.
+
+    `velocity` takes the receiver's course over ground; `positions` the direction from the previous
+    position to this one (the paper's eq. 4) with the convergence of the meridians put right;
+    `positions_raw` eq. 4 to the letter, in degrees of longitude and latitude; `dual_antenna` the
+    yaw that the receiver measures. `auto` takes the first of dual antenna, velocity, positions that
+    a fix allows. All but the antennas need `min_speed`: for positions it is the speed between the
+    two points, as in the paper.
+    """
+
+    def __init__(self, parameters: HeadingParameters) -> None:
+        self._parameters = parameters
+        self._previous: tuple[GpsFix, float] | None = None
+
+    def take(self, fix: GpsFix, time_s: float) -> Motion:
+        """Use the next fix.
+
+        Parameters
+        ----------
+        fix : GpsFix
+            One that is usable.
+        time_s : float
+            When it came, seconds; stands in where the fix itself has no time.
+        """
+        source = self._parameters.source
+        track = self._track(fix, time_s)
+        speed = fix.speed if math.isfinite(fix.speed) else track.speed
+        if source in {"auto", "dual_antenna"} and math.isfinite(fix.yaw):
+            return Motion(speed, self._heading(fix.yaw, fix.course_std, HeadingSource.DUAL_ANTENNA))
+        if source == "dual_antenna":
+            return Motion(speed, None)
+        by_velocity = math.isfinite(fix.course) and math.isfinite(fix.speed)
+        if source == "velocity" or (source == "auto" and by_velocity):
+            return Motion(speed, self._from_velocity(fix) if by_velocity else None)
+        return track
+
+    def forget(self) -> None:
+        """Forget the previous position: the next fix may be on another clock or far away."""
+        self._previous = None
+
+    def _from_velocity(self, fix: GpsFix) -> Heading | None:
+        if fix.speed < self._parameters.min_speed:
+            return None
+        across = _known(fix.speed_std, 0.1) / max(fix.speed, 1e-3)
+        return self._heading(fix.course, _known(fix.course_std, across), HeadingSource.VELOCITY)
+
+    def _track(self, fix: GpsFix, time_s: float) -> Motion:
+        """Speed and heading from the previous position to this one."""
+        previous, self._previous = self._previous, (fix, time_s)
+        if previous is None:
+            return Motion(math.nan, None)
+        before, before_s = previous
+        elapsed = (fix.time_us - before.time_us) / 1e6 if before.time_us else time_s - before_s
+        north = fix.latitude - before.latitude
+        east = wrap(fix.longitude - before.longitude)
+        ground_east = east * math.cos((fix.latitude + before.latitude) / 2)
+        distance = EARTH_RADIUS * math.hypot(north, ground_east)
+        if not 0 < elapsed <= self._parameters.timeout or not math.isfinite(distance):
+            return Motion(math.nan, None)
+        speed = distance / elapsed
+        if speed < self._parameters.min_speed or distance == 0.0:
+            return Motion(speed, None)
+        noise = _known(fix.position_std, 1.0) * RELATIVE_POSITION_NOISE / distance
+        if self._parameters.source == "positions_raw":
+            return Motion(
+                speed, self._heading(math.atan2(east, north), noise, HeadingSource.POSITIONS_RAW)
+            )
+        heading = math.atan2(ground_east, north)
+        return Motion(speed, self._heading(heading, noise, HeadingSource.POSITIONS))
+
+    def _heading(self, angle: float, std: float, source: HeadingSource) -> Heading:
+        std = min(max(_known(std, 0.0), self._parameters.min_std), math.pi)
+        return Heading(wrap(angle), std * std, source)
+
+
+class HeadingState(IntEnum):
+    """What the filter does with GPS heading now."""
+
+    NO_FIX = 0
+    TOO_SLOW = 1
+    ALIGNING = 2
+    FUSING = 3
+    REJECTING = 4
+    DEAD_RECKONING = 5
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingStatus:
+    """GPS heading, and what came of it, at one epoch."""
+
+    time_us: int
+    heading: Heading | None  # the last one measured
+    innovation: Innovation | None  # what came of it
+    yaw: float  # estimated, rad
+    yaw_std: float  # rad
+    speed: float  # of the last fix, m/s
+    time_since_fused: float  # s; NaN: never
+    fused_count: int
+    rejected_count: int
+    state: HeadingState
+
+
+class HeadingMonitor:
+    """Keeps the account of GPS heading: what came, what was fused, and for how long not."""
+
+    def __init__(self, parameters: HeadingParameters) -> None:
+        self._parameters = parameters
+        self._motion = Motion(math.nan, None)
+        self._heading: Heading | None = None
+        self._innovation: Innovation | None = None
+        self._since_fix = math.inf
+        self._since_fused = math.nan
+        self._rejecting_for = 0.0
+        self._fused_count = 0
+        self._rejected_count = 0
+
+    def advance(self, dt: float) -> None:
+        """Let time pass, seconds."""
+        self._since_fix += dt
+        self._since_fused += dt
+        if self._innovation is not None and not self._innovation.fused:
+            self._rejecting_for += dt
+
+    def note_motion(self, motion: Motion) -> None:
+        """Take note of a usable fix."""
+        self._since_fix = 0.0
+        self._motion = motion
+
+    def note_innovation(self, heading: Heading, innovation: Innovation) -> None:
+        """Take note of what the filter made of a heading."""
+        self._heading, self._innovation = heading, innovation
+        if innovation.fused:
+            self._fused_count += 1
+            self._since_fused = self._rejecting_for = 0.0
+        else:
+            self._rejected_count += 1
+
+    @property
+    def distrusts_filter(self) -> bool:
+        """Whether headings were rejected for so long that the filter must be wrong, not they."""
+        return self._rejecting_for > self._parameters.reset_after
+
+    def status(self, attitude: AttitudeState) -> HeadingStatus:
+        """Read the account at an epoch."""
+        return HeadingStatus(
+            attitude.time_us,
+            self._heading,
+            self._innovation,
+            attitude.euler[2],
+            attitude.yaw_std,
+            self._motion.speed,
+            self._since_fused,
+            self._fused_count,
+            self._rejected_count,
+            self._state(attitude.aligned),
+        )
+
+    def _state(self, aligned: bool) -> HeadingState:
+        if self._since_fix > self._parameters.timeout:
+            return HeadingState.DEAD_RECKONING if aligned else HeadingState.NO_FIX
+        if self._motion.heading is None:
+            return HeadingState.TOO_SLOW
+        if not aligned or self._innovation is None:
+            return HeadingState.ALIGNING
+        return HeadingState.FUSING if self._innovation.fused else HeadingState.REJECTING
+
+
+def _known(value: float, otherwise: float) -> float:
+    return value if math.isfinite(value) and value > 0 else otherwise

@@ -1,0 +1,67 @@
+"""The vehicle's boot clock, for an array that counts its own time.
+
+Two clocks are compared through a third, the arrival time: of all that came within some seconds, the
+frame that was least delayed tells best how far a sender's clock is ahead of it.
+"""
+
+from risaf_link.mavlink.dialect import IDS, reader
+from risaf_link.mavlink.frame import Frame
+
+WINDOW_US = 10_000_000
+SAME_CLOCK_US = 500_000  # clocks that differ by less are one
+GROUND_STATION, NO_AUTOPILOT = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
+
+_HEARTBEAT = reader("HEARTBEAT", "type", "autopilot")
+_SYSTEM_TIME = reader("SYSTEM_TIME", "time_unix_usec", "time_boot_ms")
+
+
+class _Lead:
+    """How far a sender's clock is ahead of the arrival time: the most of the last seconds."""
+
+    def __init__(self) -> None:
+        self.lead_us: int | None = None
+        self._current_us = 0
+        self._since_us = 0
+
+    def note(self, time_us: int, received_us: int) -> None:
+        lead_us = time_us - received_us
+        if self.lead_us is None or abs(lead_us - self.lead_us) > SAME_CLOCK_US:
+            self.lead_us = self._current_us = lead_us  # the first one, or a clock has jumped
+            self._since_us = received_us
+        elif 0 <= received_us - self._since_us < WINDOW_US:
+            self._current_us = max(self._current_us, lead_us)
+            self.lead_us = max(self.lead_us, lead_us)
+        else:
+            self.lead_us = max(self._current_us, lead_us)
+            self._current_us, self._since_us = lead_us, received_us
+
+
+class VehicleClock:
+    """Puts the array's time stamps on the boot clock of the vehicle's autopilot.
+
+    An autopilot is known by its HEARTBEAT, its clock by SYSTEM_TIME. Stamps stay as they are while
+    no autopilot has told its time, and where both clocks are the same.
+    """
+
+    def __init__(self) -> None:
+        self._autopilot: tuple[int, int] | None = None
+        self._vehicle, self._array = _Lead(), _Lead()
+
+    def hear(self, frame: Frame, received_us: int) -> None:
+        """Take note of a frame that may tell of an autopilot or of its time."""
+        sender = (frame.system, frame.component)
+        if frame.message_id == IDS["HEARTBEAT"] and self._autopilot is None:
+            vehicle_type, autopilot = _HEARTBEAT(frame.payload)
+            if autopilot != NO_AUTOPILOT and vehicle_type != GROUND_STATION:
+                self._autopilot = sender
+        elif frame.message_id == IDS["SYSTEM_TIME"] and sender == self._autopilot:
+            _, boot_ms = _SYSTEM_TIME(frame.payload)
+            self._vehicle.note(boot_ms * 1000, received_us)
+
+    def boot_us(self, time_us: int, received_us: int) -> int:
+        """Time of an epoch, which has just been received, on the vehicle's clock."""
+        self._array.note(time_us, received_us)
+        if self._vehicle.lead_us is None or self._array.lead_us is None:
+            return time_us
+        offset_us = self._vehicle.lead_us - self._array.lead_us
+        return time_us if abs(offset_us) < SAME_CLOCK_US else time_us + offset_us

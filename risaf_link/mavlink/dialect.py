@@ -1,0 +1,100 @@
+"""Every message definition known here: those that ship with pymavlink, and our own.
+
+The definitions come from the dialect modules that mavgen generates. Only their tables are used
+(names, field order, CRC_EXTRA, struct layout); framing is in `frame`.
+"""
+
+import struct
+from collections.abc import Callable
+from operator import itemgetter
+from typing import Any
+
+from pymavlink.dialects.v20 import all as public_dialect
+
+from risaf_link.mavlink import risaf
+
+MESSAGES: dict[int, Any] = {**public_dialect.mavlink_map, **risaf.mavlink_map}
+"""Message class of the generated dialects, by message id."""
+
+IDS: dict[str, int] = {message.msgname: message_id for message_id, message in MESSAGES.items()}
+"""Message id, by name."""
+
+CRC_EXTRA: dict[int, int] = {i: message.crc_extra for i, message in MESSAGES.items()}
+"""Seed of a message's checksum, by message id."""
+
+
+def name_of(message_id: int) -> str:
+    """Name of a message, `UNKNOWN_<id>` where no definition is known."""
+    message = MESSAGES.get(message_id)
+    return message.msgname if message else f"UNKNOWN_{message_id}"
+
+
+def reader(name: str, *fields: str) -> Callable[[bytes], tuple[Any, ...]]:
+    """Make a function that reads some fields of a message from its payload.
+
+    Parameters
+    ----------
+    name : str
+        The message.
+    *fields : str
+        At least two of its fields. An array comes as a tuple, a string as bytes.
+
+    Returns
+    -------
+    callable
+        From a payload, as it came off the wire (trailing zeros cut, or extended by a newer
+        dialect), to the values of `fields`, in that order.
+    """
+    message = MESSAGES[IDS[name]]
+    unpacker: struct.Struct = message.unpacker
+    size = unpacker.size
+    pick = itemgetter(*(_position(message, field) for field in fields))
+
+    def read(payload: bytes) -> tuple[Any, ...]:
+        return pick(unpacker.unpack(payload[:size].ljust(size, b"\0")))  # type: ignore[no-any-return]
+
+    return read
+
+
+def pack(name: str, **fields: Any) -> tuple[int, bytes]:
+    """Lay out a message's payload, whole: no trailing zeros cut.
+
+    Parameters
+    ----------
+    name : str
+        The message.
+    **fields
+        A value for every field; a sequence for an array, bytes or str for a string.
+
+    Returns
+    -------
+    message_id : int
+    payload : bytes
+
+    Raises
+    ------
+    TypeError
+        If a field is missing or not one of the message's.
+    struct.error
+        If a value does not fit its field.
+    """
+    message = MESSAGES[IDS[name]]
+    if fields.keys() != set(message.fieldnames):
+        raise TypeError(f"{name}: fields {sorted(fields)}, expected {sorted(message.fieldnames)}")
+    values: list[Any] = []
+    for field in message.ordered_fieldnames:
+        value = fields[field]
+        if isinstance(value, str):
+            values.append(value.encode())
+        elif isinstance(value, (bytes, int, float)):
+            values.append(value)
+        else:
+            values.extend(value)
+    return message.id, message.unpacker.pack(*values)
+
+
+def _position(message: Any, field: str) -> int | slice:
+    """Where a field stands in what the message's struct unpacks to."""
+    index = message.ordered_fieldnames.index(field)
+    start, length = sum(message.lengths[:index]), message.lengths[index]
+    return start if length == 1 else slice(start, start + length)

@@ -1,0 +1,141 @@
+"""Core values -> messages. With `ingest`, the only place of MAVLink's units, frames and enums."""
+
+import math
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any, Literal
+
+import numpy as np
+
+from risaf_link.core.estimate import Estimate
+from risaf_link.core.heading import HeadingSource
+from risaf_link.mavlink.dialect import pack
+from risaf_link.mavlink.frame import encode
+
+Message = Literal["ATTITUDE_QUATERNION", "GPS_HEADING_STATUS", "ARRAY_STATUS"]
+
+DEFAULT_RATES: dict[Message, float] = {
+    "ATTITUDE_QUATERNION": 50.0,
+    "GPS_HEADING_STATUS": 5.0,
+    "ARRAY_STATUS": 1.0,
+}
+"""What a link emits unless told otherwise, Hz."""
+
+ONBOARD_CONTROLLER = 18  # MAV_TYPE
+NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+MAVLINK_VERSION = 3
+
+
+class ComponentState(IntEnum):
+    """MAV_STATE, as far as it applies to an estimator."""
+
+    BOOT = 1  # nothing to estimate from has come yet
+    ACTIVE = 4
+    CRITICAL = 5  # the samples have stopped
+
+
+class Emitter:
+    """Makes the frames that go out on one link.
+
+    Messages are thinned out on the estimate's own time, so that the same input gives the same
+    output however fast it comes: of all estimates between two multiples of a message's period the
+    first one is sent.
+
+    Parameters
+    ----------
+    rates : dict
+        Message name to Hz; a rate above the array's means every epoch.
+    system, component : int
+        Whom the frames come from.
+    """
+
+    def __init__(self, rates: dict[Message, float], system: int, component: int) -> None:
+        self.rates = rates
+        self._system = system
+        self._component = component
+        self._sequence = 0
+        self._periods: dict[str, int] = {}  # which period a message was last sent in
+
+    def emit(self, estimate: Estimate) -> list[bytes]:
+        """Frames due at an estimate."""
+        frames = []
+        for name, rate in self.rates.items():
+            period = math.floor(estimate.time_us * rate / 1e6)
+            if period != self._periods.get(name):
+                self._periods[name] = period
+                frames.append(self._frame(name, **_FIELDS[name](estimate)))
+        return frames
+
+    def heartbeat(self, state: ComponentState) -> bytes:
+        """A HEARTBEAT frame."""
+        return self._frame(
+            "HEARTBEAT",
+            type=ONBOARD_CONTROLLER,
+            autopilot=NO_AUTOPILOT,
+            base_mode=0,
+            custom_mode=0,
+            system_status=state,
+            mavlink_version=MAVLINK_VERSION,
+        )
+
+    def _frame(self, name: str, **fields: Any) -> bytes:
+        frame = encode(*pack(name, **fields), self._sequence, self._system, self._component)
+        self._sequence = (self._sequence + 1) % 256
+        return frame
+
+
+def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
+    q_nb, rate_b = estimate.attitude.q_nb, estimate.attitude.rate_b
+    return {
+        "time_boot_ms": estimate.boot_us // 1000 % 2**32,
+        **dict(zip(("q1", "q2", "q3", "q4"), q_nb, strict=True)),
+        **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rate_b, strict=True)),
+        "repr_offset_q": (0.0, 0.0, 0.0, 0.0),
+    }
+
+
+def _gps_heading_status(estimate: Estimate) -> dict[str, Any]:
+    status = estimate.heading
+    heading, innovation = status.heading, status.innovation
+    return {
+        "time_usec": estimate.boot_us,
+        "heading": heading.heading if heading else math.nan,
+        "heading_std": math.sqrt(heading.variance) if heading else math.nan,
+        "innovation": innovation.value if innovation else math.nan,
+        "innovation_std": math.sqrt(innovation.variance) if innovation else math.nan,
+        "test_ratio": innovation.test_ratio if innovation else math.nan,
+        "yaw": status.yaw if estimate.attitude.aligned else math.nan,
+        "yaw_std": status.yaw_std,
+        "speed": status.speed,
+        "time_since_fused": status.time_since_fused,
+        "fused_count": status.fused_count,
+        "rejected_count": status.rejected_count,
+        "source": heading.source if heading else HeadingSource.NONE,
+        "state": status.state,
+    }
+
+
+def _array_status(estimate: Estimate) -> dict[str, Any]:
+    fused, array = estimate.fused, estimate.array
+    return {
+        "time_usec": estimate.boot_us,
+        "rate": fused.rate_b,
+        "rate_std": np.sqrt(fused.variance),
+        "epochs": array.epochs,
+        "epochs_incomplete": array.epochs_incomplete,
+        "samples_lost": array.samples_lost,
+        "sensors_expected": array.sensors,
+        "sensors_valid": fused.valid,
+        "active": fused.active,
+        "healthy": array.health.healthy,
+        "suspect": array.health.suspect,
+        "dead": array.health.dead,
+        "array_id": array.array_id,
+    }
+
+
+_FIELDS: dict[str, Callable[[Estimate], dict[str, Any]]] = {
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "GPS_HEADING_STATUS": _gps_heading_status,
+    "ARRAY_STATUS": _array_status,
+}
