@@ -111,6 +111,7 @@ class Pipeline:
         return Estimate(
             epoch.time_us,
             self._clock.boot_us(epoch.time_us, received_us),
+            self._elapsed,
             fused,
             attitude,
             self._monitor.status(attitude),

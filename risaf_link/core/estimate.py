@@ -26,6 +26,7 @@ class Estimate:
 
     time_us: int  # as the samples were stamped
     boot_us: int  # the same instant on the vehicle's boot clock
+    elapsed: float  # seconds since the first epoch, whatever the clocks did
     fused: FusedRate
     attitude: AttitudeState
     heading: HeadingStatus

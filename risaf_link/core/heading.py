@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from risaf_link.core.attitude import AttitudeState, Innovation
+from risaf_link.core.earth import radii
 from risaf_link.core.rotation import wrap
 
-EARTH_RADIUS = 6_371_008.8  # m, the mean radius of WGS 84
 RELATIVE_POSITION_NOISE = 0.1
 """Noise between two consecutive positions as a share of the receiver's absolute accuracy: most of
 a receiver's position error changes within minutes, not between fixes."""
@@ -125,10 +125,12 @@ class HeadingFinder:
             return Motion(math.nan, None)
         before, before_s = previous
         elapsed = (fix.time_us - before.time_us) / 1e6 if before.time_us else time_s - before_s
-        north = fix.latitude - before.latitude
-        east = wrap(fix.longitude - before.longitude)
-        ground_east = east * math.cos((fix.latitude + before.latitude) / 2)
-        distance = EARTH_RADIUS * math.hypot(north, ground_east)
+        latitude = (fix.latitude + before.latitude) / 2
+        per_north, per_east = radii(latitude)
+        turned_north = fix.latitude - before.latitude
+        turned_east = wrap(fix.longitude - before.longitude)
+        north, east = float(per_north * turned_north), float(per_east * turned_east)
+        distance = math.hypot(north, east)
         if not 0 < elapsed <= self._parameters.timeout or not math.isfinite(distance):
             return Motion(math.nan, None)
         speed = distance / elapsed
@@ -137,9 +139,12 @@ class HeadingFinder:
         noise = _known(fix.position_std, 1.0) * RELATIVE_POSITION_NOISE / distance
         if self._parameters.source == "positions_raw":
             return Motion(
-                speed, self._heading(math.atan2(east, north), noise, HeadingSource.POSITIONS_RAW)
+                speed,
+                self._heading(
+                    math.atan2(turned_east, turned_north), noise, HeadingSource.POSITIONS_RAW
+                ),
             )
-        heading = math.atan2(ground_east, north)
+        heading = math.atan2(east, north)
         return Motion(speed, self._heading(heading, noise, HeadingSource.POSITIONS))
 
     def _heading(self, angle: float, std: float, source: HeadingSource) -> Heading:

@@ -56,7 +56,7 @@ def reader(name: str, *fields: str) -> Callable[[bytes], tuple[Any, ...]]:
     return read
 
 
-def pack(name: str, **fields: Any) -> tuple[int, bytes]:
+def pack(name: str, /, **fields: Any) -> tuple[int, bytes]:
     """Lay out a message's payload, whole: no trailing zeros cut.
 
     Parameters

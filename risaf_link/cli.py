@@ -1,0 +1,332 @@
+"""The command line. Errors are one line; exit status 0 done, 2 user's mistake, 3 input unusable."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from risaf_link import __version__
+from risaf_link.errors import ConfigError, LinkError, LogError, RisafError
+
+if TYPE_CHECKING:  # what a command needs is imported when it runs: help must come at once
+    from risaf_link.config import Config
+    from risaf_link.core.estimate import Estimate
+    from risaf_link.publish.plot import HeadingPlot
+
+EXIT_STATUS: dict[type[RisafError], int] = {ConfigError: 2, LinkError: 2, LogError: 3}
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+Sink = Callable[[int, "Estimate"], None]
+
+
+class _Commands(click.Group):
+    """Turns errors that are meant for the user into one line and an exit status."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except RisafError as error:
+            click.echo(f"risaf-link: {error}", err=True)
+            ctx.exit(EXIT_STATUS.get(type(error), 1))
+
+
+class _Span(click.ParamType[Any]):
+    """A time span, seconds."""
+
+    name = "A:B"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            start, end = map(float, value.split(":"))
+        except ValueError:
+            self.fail(f"found {value!r}, expected A:B in seconds, such as 100:300", param, ctx)
+        if not 0 <= start < end:
+            self.fail(f"found {value!r}, expected 0 <= A < B", param, ctx)
+        return start, end
+
+
+def _configured(command: Command) -> Command:
+    """Add the options that make a configuration."""
+    setting = click.option(
+        "--set",
+        "settings",
+        metavar="KEY=VALUE",
+        multiple=True,
+        help="Set one key over the configuration, such as fusion.method=mean. Repeatable.",
+    )
+    file = click.option(
+        "--config",
+        "config_path",
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help="A YAML file; config/risaf_link.yaml shows every key.  [default: built-in defaults]",
+    )
+    return file(setting(command))
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="risaf-link")
+def main() -> None:
+    r"""One trustworthy attitude and heading from an array of cheap MEMS gyros, over MAVLink.
+
+    \b
+    risaf-link run --config vehicle.yaml
+    risaf-link replay drive.tlog --outage 100:300 --csv drive.csv
+    risaf-link inspect drive.tlog
+    """
+
+
+@main.command()
+@_configured
+@click.option("-v", "--verbose", is_flag=True, help="Say more, such as which peers come and go.")
+def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> None:
+    r"""Run the service until it is interrupted.
+
+    Links that cannot be opened yet are retried for ever; SIGINT and SIGTERM end it.
+
+    \b
+    risaf-link run --config vehicle.yaml
+    risaf-link run --set links.0.url=serial:///dev/ttyACM0:3000000
+    """
+    import asyncio
+    import logging
+
+    from risaf_link.config import load
+    from risaf_link.service import Service, until_told
+
+    level = logging.INFO if verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(levelname)s %(message)s")
+    service = Service(load(config_path, settings))
+    asyncio.run(until_told(service.run()))
+
+
+@main.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@_configured
+@click.option(
+    "--speed",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="N",
+    help="Times real time.  [default: as fast as it goes]",
+)
+@click.option(
+    "--start",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    metavar="S",
+    help="Skip the first S seconds of the log.",
+)
+@click.option(
+    "--end",
+    type=click.FloatRange(min=0),
+    default=float("inf"),
+    metavar="S",
+    help="Stop after S seconds of the log.",
+)
+@click.option(
+    "--outage",
+    "outages",
+    type=_Span(),
+    multiple=True,
+    help="Withhold GPS from A to B seconds after the first sample, and score the heading "
+    "against it. Repeatable.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="OUT.tlog",
+    help="Write what the service would have sent.",
+)
+@click.option(
+    "--csv",
+    type=click.Path(path_type=Path),
+    metavar="OUT.csv",
+    help="Write one row an epoch; rad, rad/s.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="OUT.png",
+    help="Draw heading and error (needs the extra `plot`).",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
+def replay(log: Path, config_path: Path | None, settings: tuple[str, ...], **options: Any) -> None:
+    r"""Send a tlog through the pipeline and score its heading.
+
+    Outages of GPS that the log has are found; more can be made with --outage. Headings are scored
+    against the truth where the log carries it (SITL, simulate), and against GPS that was withheld.
+
+    \b
+    risaf-link replay drive.tlog --out estimate.tlog --csv estimate.csv
+    risaf-link replay drive.tlog --outage 100:300 --set fusion.method=mean --json
+    """
+    from risaf_link.config import load
+    from risaf_link.publish.words import summary_text
+    from risaf_link.replay import Replay, Selection
+
+    config = load(config_path, settings)
+    selection = Selection(options["start"], options["end"], options["outages"])
+    replayed = Replay(config, log, selection, keep_trace=bool(options["plot"]))
+    plot = _plot(options["plot"])
+    with ExitStack() as files, _progress(log) as progress:
+        sinks = _sinks(config, options, files)
+        for received_us, estimate in replayed.estimates(progress):
+            for sink in sinks:
+                sink(received_us, estimate)
+            if plot:
+                plot.take(estimate)
+    if plot:
+        plot.draw(options["plot"], log.name, replayed.scorer.trace)
+    summary = replayed.summary()
+    click.echo(json.dumps(summary) if options["as_json"] else summary_text(log, summary))
+
+
+@main.command()
+@click.argument("scenario")
+@click.option("--seed", type=int, required=True, metavar="N", help="Of everything random.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="LOG.tlog", help="Write a tlog.")
+@click.option("--live", "url", metavar="URL", help="Send in real time over a link.")
+@click.option("--duration", type=float, metavar="S", help="Seconds.")
+@click.option("--sensors", type=int, metavar="N", help="Gyros in the array.")
+@click.option("--rate", type=float, metavar="HZ", help="Epochs a second.")
+def simulate(
+    scenario: str,
+    seed: int,
+    out: Path | None,
+    url: str | None,
+    duration: float | None,
+    sensors: int | None,
+    rate: float | None,
+) -> None:
+    r"""Simulate a vehicle with an array, as a tlog or live on a link.
+
+    SCENARIO is `circle`: the paper's circle with noise, random walks of the biases, and spikes. The
+    truth is in HIL_STATE_QUATERNION.
+
+    \b
+    risaf-link simulate circle --seed 1 --out circle.tlog
+    risaf-link simulate circle --seed 1 --sensors 150 --live udpout://127.0.0.1:14560
+    """
+    from risaf_link.sim.scenario import scenario as choose
+    from risaf_link.sim.stream import frames, record_time_us
+
+    chosen = choose(scenario, seed, duration, sensors, rate)
+    if out is None and url is None:
+        raise click.UsageError("expected --out LOG.tlog or --live URL")
+    if out:
+        from risaf_link.mavlink.tlog import record
+
+        with _open(out, "wb") as file:
+            for time_us, raw in frames(chosen):
+                file.write(record(record_time_us(time_us), raw))
+    if url:
+        import asyncio
+
+        from risaf_link.links import open_link
+        from risaf_link.links.play import play
+        from risaf_link.service import unix_us, until_told
+
+        link = open_link(url, "--live", unix_us)
+        asyncio.run(until_told(play(frames(chosen), link)))
+        counts = link.counts
+        click.echo(f"{counts.bytes_out} bytes sent, {counts.dropped_out} frames dropped", err=True)
+
+
+@main.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@_configured
+def inspect(log: Path, config_path: Path | None, settings: tuple[str, ...]) -> None:
+    r"""Tell what is in a log, and what the service could do with it.
+
+    \b
+    risaf-link inspect drive.tlog
+    """
+    from risaf_link.config import load
+    from risaf_link.publish.words import survey_text
+    from risaf_link.survey import survey
+
+    with _progress(log) as progress:
+        found = survey(load(config_path, settings), log, progress)
+    click.echo(survey_text(log, found))
+
+
+@main.command("check-config")
+@click.argument("file", type=click.Path(path_type=Path))
+def check_config(file: Path) -> None:
+    r"""Say what is wrong with a configuration, or print it whole with the defaults.
+
+    \b
+    risaf-link check-config config/risaf_link.yaml
+    """
+    from risaf_link.config import dump, load, load_calibration
+
+    config = load(file)
+    load_calibration(config)
+    click.echo(dump(config), nl=False)
+
+
+def _open(path: Path, mode: str) -> Any:
+    try:
+        return path.open(mode)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+
+
+def _sinks(config: "Config", options: dict[str, Any], files: ExitStack) -> list[Sink]:
+    """What is to be done with every estimate."""
+    from risaf_link.publish.rows import RowWriter
+    from risaf_link.replay import OutputLog
+
+    sinks: list[Sink] = []
+    if options["speed"]:
+        sinks.append(_pace(options["speed"]))
+    if options["out"]:
+        log = OutputLog(config, files.enter_context(_open(options["out"], "wb")))
+        sinks.append(lambda received_us, estimate: log.write(estimate, received_us))
+    if options["csv"]:
+        rows = RowWriter(files.enter_context(_open(options["csv"], "w")))
+        sinks.append(lambda _, estimate: rows.write(estimate))
+    return sinks
+
+
+def _pace(speed: float) -> Sink:
+    """Hold estimates back until their time has come."""
+    began: list[float] = []
+
+    def wait(_: int, estimate: "Estimate") -> None:
+        due = estimate.elapsed / speed
+        began[:] = began or [time.monotonic() - due]
+        time.sleep(max(0.0, began[0] + due - time.monotonic()))
+
+    return wait
+
+
+def _plot(path: Path | None) -> "HeadingPlot | None":
+    if path is None:
+        return None
+    from risaf_link.publish.plot import HeadingPlot
+
+    return HeadingPlot()
+
+
+@contextmanager
+def _progress(log: Path) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar over the bytes of a log, on a terminal."""
+    if not sys.stderr.isatty() or not log.is_file():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(log.name, total=log.stat().st_size)
+        yield lambda size: bar.advance(task, size)

@@ -1,0 +1,256 @@
+"""The configuration: one YAML file and what the command line sets over it.
+
+The parameters themselves stand beside the algorithms that they belong to; here they are put
+together, and what is wrong with them is said.
+"""
+
+import re
+from collections.abc import Hashable, Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import yaml
+from msgspec import Meta, Struct, field, inspect
+
+from risaf_link.core.array import ArrayCalibration, Calibration
+from risaf_link.errors import ConfigError, LinkError
+from risaf_link.links import open_link
+from risaf_link.mavlink.telemetry import DEFAULT_RATES, Message
+from risaf_link.pipeline import PipelineParameters
+
+Rates = dict[Message, Annotated[float, Meta(gt=0, le=10_000)]]
+Id = Annotated[int, Meta(ge=1, le=255)]
+
+
+class MavlinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """Who this service is on the MAVLink network."""
+
+    system_id: Id = 1
+    component_id: Id = 191
+
+
+class LinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """One link; `emit` None: the default set."""
+
+    name: Annotated[str, Meta(min_length=1)]
+    url: str
+    emit: Rates | None = None
+
+
+class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
+    """Everything that can be configured."""
+
+    mavlink: MavlinkParameters = field(default_factory=MavlinkParameters)
+    emit: Rates = field(default_factory=DEFAULT_RATES.copy)
+    links: tuple[LinkParameters, ...] = (
+        LinkParameters("vehicle", "udpin://127.0.0.1:14560"),
+        LinkParameters("ground", "udpout://127.0.0.1:14550"),
+    )
+
+    @property
+    def own(self) -> tuple[int, int]:
+        """System and component id of this service."""
+        return self.mavlink.system_id, self.mavlink.component_id
+
+
+def load(path: Path | None, settings: Iterable[str] = ()) -> Config:
+    """Read a configuration.
+
+    Parameters
+    ----------
+    path : Path or None
+        A YAML file; None: the defaults.
+    settings : iterable of str
+        `KEY=VALUE`, such as `fusion.method=mean` or `links.0.url=...`; set over the file.
+
+    Raises
+    ------
+    ConfigError
+        In one line: which key, what was found, what was expected.
+    """
+    where = f"{path}: " if path else ""
+    content = _read_yaml(path) if path else {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{where}found {_short(content)}, expected keys with values")
+    tree = {**msgspec.to_builtins(Config()), **content}
+    for setting in settings:
+        _set(tree, setting)
+    try:
+        config = msgspec.convert(tree, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(where + _explain(error, tree)) from None
+    _check_links(where, config.links)
+    return config
+
+
+def load_calibration(config: Config) -> ArrayCalibration | None:
+    """Read the file that `array.calibration` names; None if it names none.
+
+    Raises
+    ------
+    ConfigError
+        In one line: which key, what was found, what was expected.
+    """
+    if not config.array.calibration:
+        return None
+    path = Path(config.array.calibration)
+    content = _read_yaml(path)
+    try:
+        calibration = msgspec.convert(content, ArrayCalibration)
+        Calibration(calibration)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {_explain(error, content, ArrayCalibration)}") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    if config.array.sensors not in {0, len(calibration.gyros)}:
+        raise ConfigError(
+            f"array.sensors: found {config.array.sensors}, expected {len(calibration.gyros)}, "
+            f"as many as {path} calibrates"
+        )
+    return calibration
+
+
+def dump(config: Config) -> str:
+    """A configuration as YAML, whole."""
+    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False, default_flow_style=None)
+
+
+def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
+    names = [link.name for link in links]
+    for i, link in enumerate(links):
+        if link.name in names[:i]:
+            raise ConfigError(f"{where}links.{i}.name: found {link.name!r} twice, expected once")
+        try:
+            open_link(link.url, link.name, lambda: 0)
+        except LinkError as error:
+            raise ConfigError(f"{where}links.{i}.url: {error}") from None
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Refuses a key that stands twice in the same place; YAML would take the last one."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for i, key in enumerate(keys):
+            if key in keys[:i]:
+                line = node.value[i][0].start_mark.line + 1
+                raise yaml.YAMLError(f"line {line}: {key}: found twice, expected once")
+        return super().construct_mapping(node, deep)
+
+
+def _read_yaml(path: Path) -> Any:
+    try:
+        return yaml.load(path.read_text(), _StrictLoader)  # noqa: S506 it is a SafeLoader
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: found bytes that are not UTF-8, expected YAML") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def _set(tree: dict[str, Any], setting: str) -> None:
+    """Put one KEY=VALUE into the tree."""
+    path, equals, text = setting.partition("=")
+    if not equals or not path:
+        raise ConfigError(f"--set {setting}: expected KEY=VALUE")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {path}: found {text!r}, expected a YAML value") from None
+    *parents, key = path.split(".")
+    place: Any = tree
+    for parent in parents:
+        place = _child(place, parent)
+    if isinstance(place, list) and key.isdecimal() and int(key) < len(place):
+        place[int(key)] = value
+    elif isinstance(place, dict):
+        place[key] = value
+    else:
+        raise ConfigError(f"--set {path}: no such key")
+
+
+def _child(place: Any, key: str) -> Any:
+    if isinstance(place, dict):
+        return place.setdefault(key, {})
+    if isinstance(place, list) and key.isdecimal() and int(key) < len(place):
+        return place[int(key)]
+    return None
+
+
+def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = Config) -> str:
+    """What msgspec found wrong: which key, what was found, what was expected."""
+    message, _, path = str(error).partition(" - at ")
+    of_key = path.startswith("`key`")
+    steps = re.findall(r"\w+|\.\.\.", path.partition("$")[2])
+    kinds = _kinds_at(schema, steps)
+    field_name = re.search(r"field `(.*)`", message)
+    if field_name:
+        key = ".".join([*steps, field_name[1]])
+        if message.startswith("Object missing"):
+            return f"{key}: found nothing, expected a value"
+        return f"{key}: unknown key; known: {', '.join(_names(kinds, of_key=True))}"
+    key = ".".join(steps)
+    if of_key:
+        found = next(iter(set(_value_at(tree, steps)) - set(_names(kinds, of_key=True))))
+        return f"{key}.{found}: unknown key; known: {', '.join(_names(kinds, of_key=True))}"
+    found = _value_at(tree, steps)
+    if message.startswith("Invalid enum"):
+        expected = f"one of {', '.join(_names(kinds, of_key=False))}"
+    else:
+        expected = re.sub(r"^Expected |`|, got .*$", "", message).replace("null", "nothing")
+    return f"{key}: found {_short(found)}, expected {expected}"
+
+
+def _kinds_at(schema: type[Struct], steps: list[str]) -> list[inspect.Type]:
+    """What may stand at a place of the configuration."""
+    kinds = [inspect.type_info(schema)]
+    for step in steps:
+        kinds = _alternatives([_inside(kind, step) for kind in kinds])
+    return kinds
+
+
+def _alternatives(kinds: list[inspect.Type | None]) -> list[inspect.Type]:
+    found: list[inspect.Type] = []
+    for kind in kinds:
+        if isinstance(kind, inspect.UnionType):
+            found += kind.types
+        elif kind is not None:
+            found.append(kind)
+    return found
+
+
+def _inside(kind: inspect.Type, step: str) -> inspect.Type | None:
+    if isinstance(kind, inspect.StructType):
+        return next((field.type for field in kind.fields if field.name == step), None)
+    if isinstance(kind, inspect.VarTupleType | inspect.ListType):
+        return kind.item_type
+    return kind.value_type if isinstance(kind, inspect.DictType) else None
+
+
+def _names(kinds: list[inspect.Type], of_key: bool) -> list[str]:
+    """Keys, or literal values, that may stand at a place."""
+    names: list[str] = []
+    for kind in kinds:
+        if of_key and isinstance(kind, inspect.StructType):
+            names += [field.name for field in kind.fields]
+        elif of_key and isinstance(kind, inspect.DictType):
+            names += _names([kind.key_type], of_key=False)
+        elif not of_key and isinstance(kind, inspect.LiteralType):
+            names += [str(value) for value in kind.values]
+    return names
+
+
+def _value_at(tree: Any, steps: list[str]) -> Any:
+    """What was found at a place; `...` stands for the key of which msgspec does not tell."""
+    for step in steps:
+        if step == "...":
+            return list(tree.values())
+        tree = tree[int(step)] if isinstance(tree, list) else tree[step]
+    return tree
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,89 @@
+"""How far an estimated heading was from a reference."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from risaf_link.core.rotation import wrap
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingScore:
+    """Heading errors over a stretch of time. Angles in rad."""
+
+    samples: int
+    rmse: float
+    final: float  # size of the last error
+    largest: float
+    drift: float  # rad/s: by how much the error grew or shrank from first to last, over the time
+
+
+class ErrorAccount:
+    """Adds up heading errors, in constant memory."""
+
+    def __init__(self) -> None:
+        self._samples = 0
+        self._squares = 0.0
+        self._largest = 0.0
+        self._first = self._last = (0.0, 0.0)  # time, s; error, rad, unwrapped
+
+    def add(self, time_s: float, error: float) -> None:
+        """Take one error, rad, in (-pi, pi]."""
+        if self._samples:
+            error = self._last[1] + wrap(error - self._last[1])  # a drift may pass half a turn
+        else:
+            self._first = (time_s, error)
+        self._last = (time_s, error)
+        self._samples += 1
+        size = abs(wrap(error))
+        self._squares += size * size
+        self._largest = max(self._largest, size)
+
+    def score(self) -> HeadingScore | None:
+        """The score so far; None without any error."""
+        if not self._samples:
+            return None
+        seconds = self._last[0] - self._first[0]
+        return HeadingScore(
+            self._samples,
+            math.sqrt(self._squares / self._samples),
+            abs(wrap(self._last[1])),
+            self._largest,
+            abs(self._last[1] - self._first[1]) / seconds if seconds > 0 else 0.0,
+        )
+
+
+class YawTrack:
+    """The last seconds of an estimated yaw, to be read at times in between.
+
+    Parameters
+    ----------
+    length : int
+        How many estimates are kept.
+    """
+
+    def __init__(self, length: int = 4096) -> None:
+        self._points: deque[tuple[int, float]] = deque(maxlen=length)
+
+    def add(self, time_us: int, yaw: float) -> None:
+        """Take the next estimate; where time goes back the track starts anew."""
+        if self._points and time_us < self._points[-1][0]:
+            self._points.clear()
+        self._points.append((time_us, yaw))
+
+    @property
+    def newest_us(self) -> int | None:
+        """Time of the last estimate."""
+        return self._points[-1][0] if self._points else None
+
+    def at(self, time_us: int) -> float | None:
+        """Yaw at a time, interpolated; None where the track does not reach."""
+        later = None
+        for point in reversed(self._points):
+            if point[0] <= time_us:
+                if later is None or later[0] == point[0]:
+                    return point[1] if point[0] == time_us else None
+                part = (time_us - point[0]) / (later[0] - point[0])
+                return point[1] + part * wrap(later[1] - point[1])
+            later = point
+        return None

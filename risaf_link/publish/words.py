@@ -1,0 +1,89 @@
+"""Findings in words, for a terminal."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from risaf_link.survey import Survey, verdict
+
+REFERENCES = {"truth": "truth", "gps": "withheld GPS", None: "nothing to compare with"}
+
+
+def summary_text(log: Path, summary: dict[str, Any]) -> str:
+    """What a replay found."""
+    heading, truth = summary["heading"], summary["truth"]
+    lines = [
+        f"{log}: {summary['frames']} frames, {_count(sum(summary['dropped'].values()))} dropped",
+        f"{summary['epochs']} epochs of {summary['sensors']} sensors in "
+        f"{summary['duration_s']:.1f} s, {summary['epochs_incomplete']} incomplete, "
+        f"{summary['samples_lost']} samples lost; {summary['realtime_factor']:.0f} x real time",
+        f"GPS headings: {heading['fused']} fused, {heading['rejected']} rejected",
+    ]
+    if truth["rmse_deg"] is not None:
+        lines.append(
+            f"heading against truth, GPS or not: {truth['rmse_deg']:.2f} deg RMS, "
+            f"{truth['max_deg']:.2f} deg at most"
+        )
+    if not summary["outages"]:
+        lines.append("no outage of GPS")
+    for outage in summary["outages"]:
+        line = f"without GPS from {outage['start_s']:.1f} to {outage['end_s']:.1f} s, against "
+        line += REFERENCES[outage["reference"]]
+        if outage["rmse_deg"] is not None:
+            line += (
+                f": {outage['rmse_deg']:.2f} deg RMS, {outage['final_deg']:.2f} deg at the end, "
+                f"{outage['max_deg']:.2f} deg at most, {outage['drift_deg_per_min']:.2f} deg/min"
+            )
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def survey_text(log: Path, found: Survey) -> str:
+    """What is in a log."""
+    table = Table("system", "component", "message", "count", "Hz", box=None, header_style="bold")
+    for column in table.columns[3:]:
+        column.justify = "right"
+    for (system, component, name), message in sorted(found.messages.items()):
+        rate = f"{message.rate:.1f}" if message.rate else ""
+        table.add_row(str(system), str(component), name, str(message.count), rate)
+    lost = ", ".join(f"{n} of {s}/{c}" for (s, c), n in sorted(found.frames_lost.items()) if n)
+    assembly = found.assembly
+    gps = found.gps
+    lines = [
+        f"{log}: {found.duration:.1f} s, {sum(m.count for m in found.messages.values())} frames",
+        f"dropped: {_reasons(found.dropped)}; {found.bytes_skipped} bytes outside of frames; "
+        f"{found.stamps_replaced} stamps not believed",
+        f"missing by sequence number: {lost or 'none'}",
+        _text(table),
+        f"array: {found.sensors} sensors from {found.encoding or 'nothing'}, "
+        f"{assembly['epochs']} epochs at {found.epoch_rate:.1f} Hz, "
+        f"{assembly['incomplete']} incomplete, {assembly['samples_lost']} samples lost",
+        *(f"gap of {length:.1f} s at {start:.1f} s" for start, length in found.gaps[:MOST_GAPS]),
+        *([f"and {len(found.gaps) - MOST_GAPS} gaps more"] if len(found.gaps) > MOST_GAPS else []),
+        f"GPS: {gps.fixes} fixes, {gps.with_course} with course, {gps.with_yaw} with yaw, "
+        f"up to {gps.fastest:.1f} m/s",
+        f"not used: {_reasons(found.unused)}",
+        verdict(found),
+    ]
+    return "\n".join(lines)
+
+
+MOST_GAPS = 20
+
+
+def _count(number: int) -> str:
+    return str(number) if number else "none"
+
+
+def _reasons(counts: dict[str, int]) -> str:
+    return ", ".join(f"{n} {reason}" for reason, n in sorted(counts.items()) if n) or "none"
+
+
+def _text(table: Table) -> str:
+    console = Console(file=io.StringIO(), width=100)
+    with console.capture() as captured:
+        console.print(table)
+    return captured.get().rstrip()

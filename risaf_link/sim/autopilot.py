@@ -1,0 +1,68 @@
+"""The autopilot as a component: it sends GPS, and the truth for scoring.
+
+A GPS message is stamped with the time of its arrival at the autopilot, as by PX4: what it describes
+is older by the receiver's latency.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from risaf_link.core.earth import GRAVITY
+from risaf_link.sim.message import AUTOPILOT, Message, table, whole
+from risaf_link.sim.readings import clock_us
+from risaf_link.sim.receiver import fixes
+from risaf_link.sim.scenario import Scenario
+from risaf_link.sim.trajectory import sample_times
+
+TRUTH_RATE = 10.0  # Hz
+
+
+def gps(scenario: Scenario) -> Iterator[Message]:
+    """GPS_RAW_INT, as the receiver reports."""
+    receiver = scenario.receiver
+    f = fixes(scenario.trajectory, scenario.duration, receiver, scenario.generator("receiver"))
+    altitude_mm = whole(f.altitude * 1e3)
+    columns = {
+        "time_usec": clock_us(f.arrival_s),
+        "lat": whole(np.degrees(f.latitude) * 1e7),
+        "lon": whole(np.degrees(f.longitude) * 1e7),
+        "alt": altitude_mm,
+        "alt_ellipsoid": altitude_mm,  # the geoid is taken for the ellipsoid
+        "vel": whole(f.speed * 1e2),
+        "cog": whole(np.degrees(f.course) * 1e2) % 36_000,
+        "hdg_acc": whole(np.degrees(f.course_std) * 1e5),
+    }
+    return table(
+        AUTOPILOT,
+        "GPS_RAW_INT",
+        columns,
+        fix_type=3,  # GPS_FIX_TYPE_3D_FIX
+        eph=80,
+        epv=120,
+        satellites_visible=14,
+        h_acc=round(receiver.position_noise * 1e3),
+        v_acc=round(receiver.altitude_noise * 1e3),
+        vel_acc=round(receiver.velocity_noise * 1e3),
+        yaw=0,  # one antenna
+    )
+
+
+def truth(scenario: Scenario) -> Iterator[Message]:
+    """HIL_STATE_QUATERNION; accelerations are specific force, the air is still."""
+    for time_s in sample_times(TRUTH_RATE, scenario.duration):
+        t = scenario.trajectory(time_s)
+        airspeed = whole(np.linalg.norm(t.velocity_n, axis=1) * 1e2)
+        columns = {
+            "time_usec": clock_us(time_s),
+            "attitude_quaternion": t.q_nb,
+            "lat": whole(np.degrees(t.latitude) * 1e7),
+            "lon": whole(np.degrees(t.longitude) * 1e7),
+            "alt": whole(t.altitude * 1e3),
+            "ind_airspeed": airspeed,
+            "true_airspeed": airspeed,
+        }
+        columns |= zip(("rollspeed", "pitchspeed", "yawspeed"), t.rate_b.T, strict=True)
+        columns |= zip(("vx", "vy", "vz"), whole(t.velocity_n * 1e2).T, strict=True)
+        columns |= zip(("xacc", "yacc", "zacc"), whole(t.force_b / GRAVITY * 1e3).T, strict=True)
+        yield from table(AUTOPILOT, "HIL_STATE_QUATERNION", columns)

@@ -1,0 +1,42 @@
+"""A scenario as the MAVLink frames that its vehicle would send."""
+
+from collections.abc import Iterator
+from heapq import merge
+from itertools import count
+
+from risaf_link.mavlink.frame import encode
+from risaf_link.sim import array, autopilot
+from risaf_link.sim.message import ARRAY, AUTOPILOT, by_time
+from risaf_link.sim.scenario import Scenario
+
+SYSTEM = 1
+EPOCH_START_US = 1_767_225_600_000_000  # 2026-01-01: when every scenario's vehicle booted
+
+
+def frames(scenario: Scenario) -> Iterator[tuple[int, bytes]]:
+    """Run a scenario.
+
+    Yields
+    ------
+    time_us : int
+        When the frame is sent, on the vehicle's clock; it never goes back.
+    raw : bytes
+        One frame.
+    """
+    sources = (array.status, array.epochs, autopilot.gps, autopilot.truth)
+    sequences = {AUTOPILOT: count(), ARRAY: count()}
+    messages = merge(*(source(scenario) for source in sources), key=by_time)
+    for time_us, component, message_id, payload in messages:
+        sequence = next(sequences[component]) & 0xFF
+        yield time_us, encode(message_id, payload, sequence, SYSTEM, component)
+
+
+def record_time_us(time_us: int) -> int:
+    """Turn a time of the vehicle's clock into that of a tlog's record.
+
+    Returns
+    -------
+    int
+        Microseconds since 1970; the two low bits are cleared.
+    """
+    return EPOCH_START_US + time_us & ~3
