@@ -76,7 +76,7 @@ def _configured(command: Command) -> Command:
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="risaf-link")
 def main() -> None:
-    r"""One trustworthy attitude and heading from an array of cheap MEMS gyros, over MAVLink.
+    """One trustworthy attitude and heading from an array of cheap MEMS gyros, over MAVLink.
 
     \b
     risaf-link run --config vehicle.yaml
@@ -89,7 +89,7 @@ def main() -> None:
 @_configured
 @click.option("-v", "--verbose", is_flag=True, help="Say more, such as which peers come and go.")
 def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> None:
-    r"""Run the service until it is interrupted.
+    """Run the service until it is interrupted.
 
     Links that cannot be opened yet are retried for ever; SIGINT and SIGTERM end it.
 
@@ -160,7 +160,7 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
 def replay(log: Path, config_path: Path | None, settings: tuple[str, ...], **options: Any) -> None:
-    r"""Send a tlog through the pipeline and score its heading.
+    """Send a tlog through the pipeline and score its heading.
 
     Outages of GPS that the log has are found; more can be made with --outage. Headings are scored
     against the truth where the log carries it (SITL, simulate), and against GPS that was withheld.
@@ -170,8 +170,8 @@ def replay(log: Path, config_path: Path | None, settings: tuple[str, ...], **opt
     risaf-link replay drive.tlog --outage 100:300 --set fusion.method=mean --json
     """
     from risaf_link.config import load
-    from risaf_link.publish.words import summary_text
     from risaf_link.replay import Replay, Selection
+    from risaf_link.words import summary_text
 
     config = load(config_path, settings)
     selection = Selection(options["start"], options["end"], options["outages"])
@@ -207,7 +207,7 @@ def simulate(
     sensors: int | None,
     rate: float | None,
 ) -> None:
-    r"""Simulate a vehicle with an array, as a tlog or live on a link.
+    """Simulate a vehicle with an array, as a tlog or live on a link.
 
     SCENARIO is `circle`: the paper's circle with noise, random walks of the biases, and spikes. The
     truth is in HIL_STATE_QUATERNION.
@@ -245,14 +245,14 @@ def simulate(
 @click.argument("log", type=click.Path(path_type=Path))
 @_configured
 def inspect(log: Path, config_path: Path | None, settings: tuple[str, ...]) -> None:
-    r"""Tell what is in a log, and what the service could do with it.
+    """Tell what is in a log, and what the service could do with it.
 
     \b
     risaf-link inspect drive.tlog
     """
     from risaf_link.config import load
-    from risaf_link.publish.words import survey_text
     from risaf_link.survey import survey
+    from risaf_link.words import survey_text
 
     with _progress(log) as progress:
         found = survey(load(config_path, settings), log, progress)
@@ -262,7 +262,7 @@ def inspect(log: Path, config_path: Path | None, settings: tuple[str, ...]) -> N
 @main.command("check-config")
 @click.argument("file", type=click.Path(path_type=Path))
 def check_config(file: Path) -> None:
-    r"""Say what is wrong with a configuration, or print it whole with the defaults.
+    """Say what is wrong with a configuration, or print it whole with the defaults.
 
     \b
     risaf-link check-config config/risaf_link.yaml
@@ -330,3 +330,7 @@ def _progress(log: Path) -> Iterator[Callable[[int], None]]:
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(log.name, total=log.stat().st_size)
         yield lambda size: bar.advance(task, size)
+
+
+if __name__ == "__main__":
+    main(prog_name="risaf-link")

@@ -6,6 +6,7 @@ together, and what is wrong with them is said.
 
 import re
 from collections.abc import Hashable, Iterable
+from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -70,10 +71,10 @@ def load(path: Path | None, settings: Iterable[str] = ()) -> Config:
         In one line: which key, what was found, what was expected.
     """
     where = f"{path}: " if path else ""
-    content = _read_yaml(path) if path else {}
+    content = (_read_yaml(path) or {}) if path else {}
     if not isinstance(content, dict):
         raise ConfigError(f"{where}found {_short(content)}, expected keys with values")
-    tree = {**msgspec.to_builtins(Config()), **content}
+    tree = {**_tree(Config()), **content}
     for setting in settings:
         _set(tree, setting)
     try:
@@ -113,7 +114,13 @@ def load_calibration(config: Config) -> ArrayCalibration | None:
 
 def dump(config: Config) -> str:
     """A configuration as YAML, whole."""
-    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False, default_flow_style=None)
+    return yaml.safe_dump(_tree(config), sort_keys=False, default_flow_style=None)
+
+
+def _tree(config: Config) -> dict[str, Any]:
+    """A configuration as YAML has it: dicts, lists and plain values."""
+    tree: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(config))
+    return tree
 
 
 def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
@@ -184,6 +191,8 @@ def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = C
     message, _, path = str(error).partition(" - at ")
     of_key = path.startswith("`key`")
     steps = re.findall(r"\w+|\.\.\.", path.partition("$")[2])
+    if "..." in steps:
+        steps[steps.index("...")] = _culprit(error, tree, steps, schema)
     kinds = _kinds_at(schema, steps)
     field_name = re.search(r"field `(.*)`", message)
     if field_name:
@@ -242,11 +251,27 @@ def _names(kinds: list[inspect.Type], of_key: bool) -> list[str]:
     return names
 
 
+def _culprit(
+    error: msgspec.ValidationError, tree: Any, steps: list[str], schema: type[Struct]
+) -> str:
+    """Which key of a mapping msgspec means by `...`: the one that alone makes the same error."""
+    before = steps[: steps.index("...")]
+    for key, value in _value_at(tree, before).items():
+        trial = deepcopy(tree)
+        place = _value_at(trial, before)
+        place.clear()
+        place[key] = value
+        try:
+            msgspec.convert(trial, schema)
+        except msgspec.ValidationError as other:
+            if str(other) == str(error):
+                return str(key)
+    return "..."
+
+
 def _value_at(tree: Any, steps: list[str]) -> Any:
-    """What was found at a place; `...` stands for the key of which msgspec does not tell."""
+    """What was found at a place."""
     for step in steps:
-        if step == "...":
-            return list(tree.values())
         tree = tree[int(step)] if isinstance(tree, list) else tree[step]
     return tree
 

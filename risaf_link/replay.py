@@ -14,13 +14,13 @@ from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingParameters, He
 from risaf_link.core.rotation import wrap, yaw_of
 from risaf_link.core.scoring import ErrorAccount, HeadingScore, YawTrack
 from risaf_link.errors import ConfigError, LogError
+from risaf_link.links.file import read
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.ingest import Ingest, Truth, truth_of
 from risaf_link.mavlink.telemetry import ComponentState, Emitter
 from risaf_link.mavlink.tlog import SENT, Record, TlogReader, record
 from risaf_link.pipeline import Pipeline
 
-CHUNK = 1 << 16  # bytes
 SHORTEST_OUTAGE = 5.0  # s, of those that are found in a log
 
 Reference = Literal["truth", "gps"]
@@ -281,7 +281,7 @@ class Replay:
 
     def _records(self, progress: Callable[[int], None]) -> Iterator[Record]:
         first_us: int | None = None
-        self._reader = TlogReader(chunks_of(self._path, progress))
+        self._reader = TlogReader(read(self._path, progress))
         for logged in self._reader:
             first_us = logged.time_us if first_us is None else first_us
             log_time = (logged.time_us - first_us) / 1e6
@@ -320,23 +320,6 @@ class Replay:
             f"{self._path}: found {self._frames} frames but no gyro samples, expected one of "
             "GYRO_ARRAY (with IMU_ARRAY_INFO), DEBUG_FLOAT_ARRAY, HIGHRES_IMU, RAW_IMU, SCALED_IMU"
         )
-
-
-def chunks_of(path: Path, progress: Callable[[int], None]) -> Iterator[bytes]:
-    """Read a file piece by piece.
-
-    Raises
-    ------
-    LogError
-        If it cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            while chunk := file.read(CHUNK):
-                progress(len(chunk))
-                yield chunk
-    except OSError as error:
-        raise LogError(f"{path}: {error.strerror or error}") from None
 
 
 def _degrees(score: HeadingScore | None) -> dict[str, float | int | None]:

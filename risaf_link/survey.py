@@ -9,12 +9,12 @@ from pathlib import Path
 from risaf_link.config import Config
 from risaf_link.core.heading import GpsFix
 from risaf_link.errors import LogError
+from risaf_link.links.file import read
 from risaf_link.mavlink.dialect import name_of
 from risaf_link.mavlink.epoch import EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.ingest import Ingest, truth_of
 from risaf_link.mavlink.tlog import TlogReader
-from risaf_link.replay import chunks_of
 
 GAP = 1.0  # s, between epochs
 
@@ -86,7 +86,7 @@ def survey(config: Config, path: Path, progress: Callable[[int], None] = lambda 
     LogError
         If it cannot be read, or holds no frame.
     """
-    reader = TlogReader(chunks_of(path, progress))
+    reader = TlogReader(read(path, progress))
     ingest = Ingest(config.array, config.gps, config.own)
     assembler = EpochAssembler(config.array)
     found = Survey(assembly=assembler.counts, unused=ingest.counts)

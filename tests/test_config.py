@@ -1,0 +1,166 @@
+"""A configuration is strict, and what is wrong with it is said in one line."""
+
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+import yaml
+
+from risaf_link.config import Config, dump, load, load_calibration
+from risaf_link.errors import ConfigError
+
+EXAMPLE = Path(__file__).parents[1] / "config" / "risaf_link.yaml"
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def leaves(tree: object, path: str = "") -> set[str]:
+    if isinstance(tree, dict) and tree and path != "emit":
+        return {
+            leaf
+            for key, value in tree.items()
+            for leaf in leaves(value, f"{path}.{key}"[not path :])
+        }
+    return {path}
+
+
+def test_the_example_holds_every_key_with_its_default():
+    assert load(EXAMPLE) == Config()
+    assert leaves(yaml.safe_load(EXAMPLE.read_text())) == leaves(msgspec.to_builtins(Config()))
+
+
+def test_the_example_says_of_every_key_why():
+    lines = [line for line in EXAMPLE.read_text().splitlines() if re.match(r" +\w+: ", line)]
+    assert all("#" in line for line in lines if line.split(":")[0].strip() not in Config().emit)
+
+
+def test_what_is_dumped_loads_again(tmp_path):
+    config = load(None, ["fusion.method=mean", "links.1.url=tcpout://localhost:5760", "array.id=3"])
+    assert load(written(tmp_path / "c.yaml", dump(config))) == config
+
+
+def test_an_empty_file_means_the_defaults(tmp_path):
+    assert load(written(tmp_path / "c.yaml", "# nothing\n")) == Config()
+
+
+def test_every_key_can_be_set_from_the_command_line():
+    for key in leaves(msgspec.to_builtins(Config())):
+        value: object = msgspec.to_builtins(Config())
+        for step in key.split("."):
+            value = value[step]  # type: ignore[index]
+        assert load(None, [f"{key}={yaml.safe_dump(value, default_flow_style=True)}"]) == Config()
+
+
+def test_settings_go_over_the_file(tmp_path):
+    path = written(tmp_path / "c.yaml", "fusion: {alpha: 0.9, method: mean}")
+    fusion = load(path, ["fusion.alpha=0.5"]).fusion
+    assert (fusion.alpha, fusion.method) == (0.5, "mean")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "fusion: {gaet: 1}",
+            "fusion.gaet: unknown key; known: method, alpha, lower_quantile, upper_quantile",
+        ),
+        ("fusion: {alpha: '0.9'}", "fusion.alpha: found '0.9', expected float"),
+        ("fusion: {alpha: 1}", "fusion.alpha: found 1, expected float < 1.0"),
+        ("fusion: {alpha: .nan}", "fusion.alpha: found nan, expected float >= 0.0"),
+        ("fusion: {method: best}", "fusion.method: found 'best', expected one of "),
+        ("fusion:", "fusion: found nothing, expected object"),
+        ("heading: {source: [auto]}", "heading.source: found ['auto'], expected str"),
+        ("array: {encodings: [GYRO]}", "array.encodings.0: found 'GYRO', expected one of "),
+        ("array: {id: 256}", "array.id: found 256, expected int <= 255"),
+        ("array: {sensors: 1.5}", "array.sensors: found 1.5, expected int"),
+        ("emit: {ATTITUDE: 5}", "emit.ATTITUDE: unknown key; known: ARRAY_STATUS, ATTITUDE_QUAT"),
+        (
+            "emit: {ATTITUDE_QUATERNION: 50, ARRAY_STATUS: 0}",
+            "emit.ARRAY_STATUS: found 0, expected float > 0.0",
+        ),
+        ("links: [{url: 'udpin://:1'}]", "links.0.name: found nothing, expected a value"),
+        (
+            "links: [{name: a, url: x, speed: 1}]",
+            "links.0.speed: unknown key; known: name, url, emit",
+        ),
+        ("links: [{name: a, url: 'udp://x:1'}]", "links.0.url: a: 'udp://x:1' found, one of "),
+        (
+            "links: [{name: a, url: 'udpin://x:1'}, {name: a, url: 'udpin://x:2'}]",
+            "links.1.name: found 'a' twice, expected once",
+        ),
+        (
+            "fusion: {alpha: 0.9}\nfusion: {alpha: 0.8}",
+            "line 2: fusion: found twice, expected once",
+        ),
+        ("- 1", "found [1], expected keys with values"),
+        ("fusion: {", "while parsing a flow"),
+        ("a: b: c", "mapping values are not allowed here"),
+    ],
+)
+def test_one_line_says_key_found_and_expected(tmp_path, text, message):
+    path = written(tmp_path / "c.yaml", text)
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    line = str(caught.value)
+    assert message in line
+    assert line.startswith(f"{path}: ")
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("fusion.alpha", "--set fusion.alpha: expected KEY=VALUE"),
+        ("fusion.gaet=1", "fusion.gaet: unknown key"),
+        ("links.7.url=udpin://a:1", "--set links.7.url: no such key"),
+        ("fusion.alpha.x=1", "--set fusion.alpha.x: no such key"),
+        ("fusion.alpha={", "--set fusion.alpha: found '{', expected a YAML value"),
+    ],
+)
+def test_a_wrong_setting_is_named(setting, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        load(None, [setting])
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
+        load(tmp_path / "none.yaml")
+
+
+class TestCalibrationFile:
+    def load(self, tmp_path, text, *settings):
+        path = written(tmp_path / "calibration.yaml", text)
+        return load_calibration(load(None, [f"array.calibration={path}", *settings]))
+
+    def test_no_file_no_calibration(self):
+        assert load_calibration(Config()) is None
+
+    def test_what_is_left_out_is_perfect(self, tmp_path):
+        calibration = self.load(tmp_path, "gyros: [{bias: [0.1, 0, 0]}, {}]")
+        assert [triad.bias for triad in calibration.gyros] == [[0.1, 0, 0], [0, 0, 0]]
+        assert calibration.gyros[1].scale == [1, 1, 1]
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("gyros: []", "gyros: found [], expected array of length >= 1"),
+            (
+                "gyros: [{bias: [1, 2]}]",
+                "gyros.0.bias: found [1, 2], expected array of length >= 3",
+            ),
+            ("gyros: [{}, {skale: 1}]", "gyros.1.skale: unknown key; known: bias, scale, "),
+            ("gyros: [{mounting: [0, 0, 0, 0]}]", "gyros[0].mounting: [0.0, 0.0, 0.0, 0.0] is no"),
+            ("", "found nothing, expected object"),
+        ],
+    )
+    def test_what_is_wrong_is_named(self, tmp_path, text, message):
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            self.load(tmp_path, text)
+
+    def test_it_must_be_for_as_many_sensors_as_configured(self, tmp_path):
+        with pytest.raises(ConfigError, match=r"array\.sensors: found 3, expected 1"):
+            self.load(tmp_path, "gyros: [{}]", "array.sensors=3")

@@ -1,0 +1,156 @@
+"""Links with several peers."""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+from test_links import FRAME, HOST, SOON, port_of, running, until
+
+from risaf_link.links import TcpInLink, TcpOutLink, UdpInLink, tcp, udp
+
+
+@pytest.fixture
+def udp_socket() -> Iterator[Callable[[], socket.socket]]:
+    with contextlib.ExitStack() as stack:
+
+        def make() -> socket.socket:
+            made = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            made.bind((HOST, 0))
+            made.setblocking(False)
+            return made
+
+        yield make
+
+
+async def receive_from(udp_socket: socket.socket) -> bytes:
+    return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(udp_socket, 4096), 10)
+
+
+async def test_udp_peers_are_named_and_all_are_answered(
+    udp_socket: Callable[[], socket.socket],
+) -> None:
+    link = UdpInLink("ground", HOST, 0)
+    first, second = udp_socket(), udp_socket()
+    async with running(link) as [inbox]:
+        for data, peer in (b"1", first), (b"2", second), (b"3", first):
+            peer.sendto(data, (HOST, port_of(link)))
+            await until(lambda d=data: inbox.stream.endswith(d))
+        names = [f"{HOST}:{peer.getsockname()[1]}" for peer in (first, second)]
+        assert inbox == [(b"1", names[0]), (b"2", names[1]), (b"3", names[0])]
+        link.send(FRAME)
+        assert await receive_from(first) == await receive_from(second) == FRAME
+        assert link.counts.bytes_out == 2 * len(FRAME)
+
+
+async def test_the_udp_peer_silent_longest_gives_way_to_a_new_one(
+    udp_socket: Callable[[], socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "MOST_PEERS", 2)
+    link = UdpInLink("ground", HOST, 0)
+    first, second, third = udp_socket(), udp_socket(), udp_socket()
+    async with running(link) as [inbox]:
+        for count, peer in enumerate([first, second, first, third], start=1):
+            peer.sendto(b"here", (HOST, port_of(link)))
+            await until(lambda n=count: len(inbox) == n)
+        link.send(FRAME)
+        assert await receive_from(first) == await receive_from(third) == FRAME
+        with pytest.raises(BlockingIOError):
+            second.recv(4096)
+
+
+async def test_a_udp_peer_silent_for_a_minute_is_forgotten(
+    udp_socket: Callable[[], socket.socket], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "risaf_link")
+    now_s = 1000.0
+    link = UdpInLink("ground", HOST, 0, now_s=lambda: now_s)
+    peer = udp_socket()
+    async with running(link) as [inbox]:
+        peer.sendto(b"here", (HOST, port_of(link)))
+        await until(lambda: inbox)
+        now_s += 60.0
+        link.send(b"kept")
+        now_s += 0.1
+        link.send(b"lost")
+        assert await receive_from(peer) == b"kept"
+        assert link.counts.dropped_out == 1
+    name = f"{HOST}:{peer.getsockname()[1]}"
+    assert caplog.messages[1:] == [f"ground: peer {name}: new", f"ground: peer {name}: forgotten"]
+
+
+async def test_garbage_and_empty_datagrams_are_survived(
+    udp_socket: Callable[[], socket.socket],
+) -> None:
+    link = UdpInLink("ground", HOST, 0)
+    silent, loud = udp_socket(), udp_socket()
+    async with running(link) as [inbox]:
+        silent.sendto(b"", (HOST, port_of(link)))
+        garbage = [bytes([0xFD]) * n for n in (1, 2000, 60_000)]
+        for data in garbage:
+            loud.sendto(data, (HOST, port_of(link)))
+        await until(lambda: len(inbox) == 3)
+        assert [data for data, _ in inbox] == garbage
+        link.send(FRAME)
+        assert await receive_from(loud) == FRAME
+        with pytest.raises(BlockingIOError):
+            silent.recv(4096)
+
+
+async def test_a_burst_of_datagrams_waits_in_the_sockets_buffer(
+    udp_socket: Callable[[], socket.socket],
+) -> None:
+    link = UdpInLink("array", HOST, 0)
+    sender = udp_socket()
+    async with running(link) as [inbox]:
+        for n in range(150):  # the event loop does not run meanwhile
+            sender.sendto(n.to_bytes(2, "big") + bytes(264), (HOST, port_of(link)))
+        await until(lambda: len(inbox) == 150)
+        assert [int.from_bytes(data[:2], "big") for data, _ in inbox] == list(range(150))
+
+
+async def test_tcp_clients_are_named_and_all_are_answered() -> None:
+    server = TcpInLink("ground", HOST, 0)
+    async with running(server) as [inbox]:
+        first = TcpOutLink("first", HOST, port_of(server))
+        second = TcpOutLink("second", HOST, port_of(server))
+        async with running(first, second) as [at_first, at_second]:
+            first.send(b"1")
+            second.send(b"2")
+            await until(lambda: len(inbox) == 2)
+            assert len(inbox.peers) == 2
+            assert all(peer.startswith(f"{HOST}:") for peer in inbox.peers)
+            server.send(FRAME)
+            await until(lambda: at_first.stream == at_second.stream == FRAME)
+
+
+async def test_a_tcp_peer_that_vanishes_is_noticed_at_both_ends() -> None:
+    server = TcpInLink("ground", HOST, 0)
+    async with running(server):
+        client = TcpOutLink("autopilot", HOST, port_of(server))
+        async with running(client):
+            await until(lambda: server._clients)
+            for end in *server._clients, client._endpoint:
+                probed = end._transport.get_extra_info("socket")
+                assert probed.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+                assert probed.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 15_000
+
+
+async def test_one_tcp_client_too_many_is_refused(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tcp, "MOST_CLIENTS", 1)
+    server = TcpInLink("ground", HOST, 0)
+    async with running(server) as [inbox]:
+        first = TcpOutLink("first", HOST, port_of(server))
+        async with running(first):
+            first.send(b"1")
+            await until(lambda: inbox.stream == b"1")
+            second = TcpOutLink("second", HOST, port_of(server), SOON)
+            async with running(second):
+                await until(lambda: second.counts.connections == 2)  # was closed, tried again
+                first.send(b"2")
+                await until(lambda: inbox.stream == b"12")
+    assert "ground: no more than 1 peers" in caplog.messages

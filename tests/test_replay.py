@@ -1,0 +1,199 @@
+"""Logs through the pipeline: what comes out, and how it is scored."""
+
+import csv
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from risaf_link.config import Config, load
+from risaf_link.core.rotation import wrap
+from risaf_link.mavlink.dialect import IDS, pack
+from risaf_link.mavlink.frame import encode
+from risaf_link.mavlink.tlog import TlogReader, record
+from risaf_link.publish.rows import COLUMNS, RowWriter
+from risaf_link.replay import OutputLog, Replay, Selection
+from risaf_link.sim.scenario import scenario
+from risaf_link.sim.stream import frames, record_time_us
+
+FIXTURES = Path(__file__).parents[1] / "sitl_fixtures"
+GRID = 0.25  # rad/s: coarse readings make ties
+
+
+def simulated(path: Path, duration: float = 12.0, sensors: int = 20, rate: float = 50) -> Path:
+    drive = scenario("circle", seed=3, duration=duration, sensors=sensors, rate=rate)
+    path.write_bytes(b"".join(record(record_time_us(t), raw) for t, raw in frames(drive)))
+    return path
+
+
+def rows_of(log: Path, config: Config) -> list[dict[str, str]]:
+    file = io.StringIO()
+    rows = RowWriter(file)
+    for _, estimate in Replay(config, log, Selection()).estimates():
+        rows.write(estimate)
+    file.seek(0)
+    return list(csv.DictReader(file))
+
+
+def debug_log(path: Path, readings: np.ndarray) -> Path:
+    """A log of DEBUG_FLOAT_ARRAY, nineteen sensors a message; readings (epochs, sensors, 3)."""
+    log = b""
+    for k, epoch in enumerate(readings):
+        for first in range(0, len(epoch), 19):
+            data = np.full(58, np.nan, np.float32)
+            chunk = epoch[first : first + 19].astype(np.float32).ravel()
+            data[: len(chunk)] = chunk
+            fields = {"name": b"gyro", "array_id": first, "data": data.tolist()}
+            message = IDS["DEBUG_FLOAT_ARRAY"], _packed("DEBUG_FLOAT_ARRAY", 10_000 * k, fields)
+            log += record(10_000 * k, encode(*message, k % 256, 1, 158))
+    path.write_bytes(log)
+    return path
+
+
+def _packed(name: str, time_us: int, fields: dict[str, object]) -> bytes:
+    return pack(name, time_usec=time_us + 1_000_000, **fields)[1]
+
+
+def paper(readings: np.ndarray, alpha: float = 0.995) -> list[tuple[np.ndarray, ...]]:
+    """Eq. 5 to 8 of the paper, channel by channel, as a reader would write them down."""
+    bias = np.zeros(readings.shape[1:])
+    results = []
+    for epoch in readings.astype(np.float32).astype(float):
+        rate, variance, active = np.zeros(3), np.zeros(3), np.zeros(3, int)
+        for axis in range(3):
+            u = epoch[:, axis]
+            mean = math.fsum(u) / len(u)
+            for i in range(len(u)):
+                bias[i, axis] = alpha * bias[i, axis] + (1 - alpha) * (u[i] - mean)
+            corrected = u - bias[:, axis]
+            lower, upper = np.quantile(corrected, [0.2, 0.8])
+            chosen = [c for c in corrected if lower <= c <= upper]
+            rate[axis] = math.fsum(chosen) / len(chosen)
+            squares = math.fsum((c - rate[axis]) ** 2 for c in chosen)
+            variance[axis] = squares / (len(chosen) - 1)
+            active[axis] = len(chosen)
+        results.append((rate, variance, active))
+    return results
+
+
+def test_fused_rates_are_those_of_the_paper_from_wire_to_csv_ties_included(tmp_path):
+    generator = np.random.default_rng(5)
+    readings = generator.normal(0.0, 1.0, (150, 45, 3))
+    readings[:, ::2] = np.round(readings[:, ::2] / GRID) * GRID
+    log = debug_log(tmp_path / "debug.tlog", readings)
+    rows = rows_of(log, load(None, ["fusion.method=risaf"]))
+    assert len(rows) == len(readings)
+    for row, (rate, variance, active) in zip(rows, paper(readings), strict=True):
+        for axis, letter in enumerate("xyz"):
+            assert float(row[f"fused_{letter}"]) == pytest.approx(rate[axis], abs=1e-9)
+            assert float(row[f"fused_var_{letter}"]) == pytest.approx(variance[axis], abs=1e-9)
+            assert int(row[f"active_{letter}"]) == active[axis]
+
+
+def test_rows_have_the_columns_and_the_precision_that_were_promised(tmp_path):
+    rows = rows_of(simulated(tmp_path / "drive.tlog", duration=2), Config())
+    assert tuple(rows[0]) == COLUMNS
+    assert [int(row["time_us"]) for row in rows] == [1_000_000 + 20_000 * k for k in range(100)]
+    q_nb = np.array([[float(row[f"q_{c}"]) for c in "wxyz"] for row in rows])
+    assert np.linalg.norm(q_nb, axis=1) == pytest.approx(1.0, abs=1e-12)
+    assert rows[0]["heading_state"] == "NO_FIX"
+    assert rows[-1]["heading_state"] == "FUSING"
+
+
+def test_an_outage_is_scored_against_truth_and_against_what_was_withheld(tmp_path):
+    log = simulated(tmp_path / "drive.tlog")
+    replay = Replay(Config(), log, Selection(outages=((6.0, 11.0),)), keep_trace=True)
+    states = [(estimate.elapsed, estimate.heading.state.name) for _, estimate in replay.estimates()]
+    assert {state for t, state in states if 8.5 < t < 11.0} == {"DEAD_RECKONING"}
+    assert [row["reference"] for row in replay.summary()["outages"]] == ["truth", "gps"]
+    for row in replay.summary()["outages"]:
+        errors = [
+            math.degrees(e)
+            for t, reference, e in replay.scorer.trace
+            if reference == row["reference"] and 6.0 <= t <= 11.0
+        ]
+        assert len(errors) > 20
+        assert (row["start_s"], row["end_s"]) == (6.0, 11.0)
+        assert row["rmse_deg"] == pytest.approx(np.sqrt(np.mean(np.square(errors))), abs=1e-3)
+        assert row["final_deg"] == pytest.approx(abs(errors[-1]), abs=1e-3)
+        assert row["max_deg"] == pytest.approx(np.max(np.abs(errors)), abs=1e-3)
+        assert row["rmse_deg"] < 3.0
+
+
+def test_gps_that_is_withheld_does_not_reach_the_filter(tmp_path):
+    log = simulated(tmp_path / "drive.tlog")
+
+    def fused(*outages: tuple[float, float]) -> int:
+        replay = Replay(Config(), log, Selection(outages=outages))
+        for _ in replay.estimates():
+            pass
+        return int(replay.summary()["heading"]["fused"])
+
+    assert fused() - fused((4.0, 8.0)) == 20  # at 5 Hz
+
+
+def test_start_and_end_cut_the_log(tmp_path):
+    log = simulated(tmp_path / "drive.tlog")
+    replay = Replay(Config(), log, Selection(start=2.0, end=5.0))
+    times = [estimate.time_us for _, estimate in replay.estimates()]
+    assert (times[0], times[-1]) == pytest.approx((3_000_000, 6_000_000), abs=20_000)
+    assert replay.summary()["duration_s"] == pytest.approx(3.0, abs=0.05)
+
+
+def test_the_output_log_has_messages_at_their_rates_and_a_heartbeat(tmp_path):
+    config = load(None, ["emit={ATTITUDE_QUATERNION: 10, ARRAY_STATUS: 1}"])
+    file = io.BytesIO()
+    output = OutputLog(config, file)
+    for received_us, estimate in Replay(
+        config, simulated(tmp_path / "d.tlog"), Selection()
+    ).estimates():
+        output.write(estimate, received_us)
+    ids = [logged.frame.message_id for logged in TlogReader([file.getvalue()])]
+    counts = {name: ids.count(IDS[name]) for name in ("ATTITUDE_QUATERNION", "ARRAY_STATUS")}
+    assert counts == {"ATTITUDE_QUATERNION": 120, "ARRAY_STATUS": 12}
+    assert ids.count(IDS["HEARTBEAT"]) in {12, 13}
+
+
+def test_a_calibration_that_is_not_the_arrays_gives_no_estimates_and_says_why(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    path.write_text("gyros: [{}, {}]")
+    config = load(None, [f"array.calibration={path}"])
+    replay = Replay(config, simulated(tmp_path / "drive.tlog", duration=1), Selection())
+    with pytest.raises(Exception, match=r"array\.calibration: .* for 2 sensors, the array has 20"):
+        list(replay.estimates())
+
+
+def test_a_calibration_is_applied_to_raw_readings(tmp_path):
+    log = simulated(tmp_path / "drive.tlog", duration=1, sensors=3)
+    path = tmp_path / "calibration.yaml"
+    upside_down = "{mounting: [0, 1, 0, 0], bias: [0.5, 0, 0]}"
+    path.write_text(f"gyros: [{', '.join([upside_down] * 3)}]")
+    plain = rows_of(log, load(None, ["fusion.method=mean"]))
+    turned = rows_of(log, load(None, ["fusion.method=mean", f"array.calibration={path}"]))
+    for before, after in zip(plain, turned, strict=True):
+        assert float(after["fused_x"]) == pytest.approx(float(before["fused_x"]) - 0.5)
+        assert float(after["fused_y"]) == pytest.approx(-float(before["fused_y"]))
+        assert float(after["fused_z"]) == pytest.approx(-float(before["fused_z"]))
+
+
+class TestRecordings:
+    @pytest.mark.parametrize("log", sorted(FIXTURES.glob("*.tlog")), ids=lambda path: path.stem)
+    def test_an_autopilots_gyros_make_a_small_array(self, log):
+        replay = Replay(Config(), log, Selection(end=30.0))
+        estimates = [estimate for _, estimate in replay.estimates()]
+        summary = replay.summary()
+        assert (summary["sensors"], summary["dropped"]) == (3, {})
+        q_nb = np.array([estimate.attitude.q_nb for estimate in estimates])
+        assert np.linalg.norm(q_nb, axis=1) == pytest.approx(1.0, abs=1e-12)
+        assert all(-math.pi <= wrap(e.heading.yaw) <= math.pi for e in estimates)
+
+    def test_the_unplugged_receiver_is_found_and_scored_against_the_truth(self):
+        replay = Replay(Config(), FIXTURES / "rover_sitl_gps_unplugged.tlog", Selection())
+        for _ in replay.estimates():
+            pass
+        (outage,) = replay.summary()["outages"]
+        assert outage["reference"] == "truth"
+        assert (outage["start_s"], outage["end_s"]) == pytest.approx((73.3, 229.4), abs=0.2)
+        assert 0 < outage["rmse_deg"] < 15

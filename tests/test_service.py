@@ -1,0 +1,217 @@
+"""The daemon on real sockets and a real pty, against pymavlink as ground station."""
+
+import asyncio
+import io
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tty
+from itertools import groupby
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import all as public
+
+from risaf_link.config import Config, load
+from risaf_link.links import UdpInLink
+from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.frame import Frame, FrameParser
+from risaf_link.mavlink.tlog import TlogReader
+from risaf_link.replay import OutputLog, Replay, Selection
+from risaf_link.service import Service
+from risaf_link.sim.scenario import scenario
+from risaf_link.sim.stream import frames
+
+SAFETY_S = 20
+EPOCHS = 60
+
+
+def bursts(epochs: int = EPOCHS, sensors: int = 60) -> list[list[bytes]]:
+    """Frames of a simulated vehicle, grouped by the time at which they are sent."""
+    stream = frames(scenario("circle", seed=7, duration=epochs / 100, sensors=sensors))
+    return [[raw for _, raw in group] for _, group in groupby(stream, key=lambda sent: sent[0])]
+
+
+def is_epoch(burst: list[bytes]) -> bool:
+    return any(raw[7:10] == IDS["GYRO_ARRAY"].to_bytes(3, "little") for raw in burst)
+
+
+class Ground(asyncio.DatagramProtocol):
+    """A UDP socket that sends samples to the service and listens to what it says."""
+
+    def __init__(self) -> None:
+        self._parser = FrameParser()
+        self._queue: asyncio.Queue[Frame] = asyncio.Queue()
+        self.heard: list[Frame] = []
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = transport
+        self.port: int = transport.get_extra_info("sockname")[1]
+
+    def datagram_received(self, data: bytes, _addr: object) -> None:
+        for frame in self._parser.receive_data(data):
+            self.heard.append(frame)
+            self._queue.put_nowait(frame)
+
+    async def next(self, name: str) -> Frame:
+        async with asyncio.timeout(SAFETY_S):
+            while True:
+                frame = await self._queue.get()
+                if frame.message_id == IDS[name]:
+                    return frame
+
+
+@pytest.fixture
+async def ground():
+    loop = asyncio.get_running_loop()
+    transport, protocol = await loop.create_datagram_endpoint(Ground, local_addr=("127.0.0.1", 0))
+    yield protocol
+    transport.close()
+
+
+class Running:
+    """A service that runs while the block is entered; links that must be up are waited for."""
+
+    def __init__(self, config: Config, up: int) -> None:
+        self._service = Service(config)
+        self._up = up
+
+    async def __aenter__(self) -> Service:
+        self._task = asyncio.create_task(self._service.run())
+        await until(lambda: all(li.counts.connections for li in self._service.links[: self._up]))
+        return self._service
+
+    async def __aexit__(self, *_: object) -> None:
+        self._task.cancel()
+        await asyncio.wait([self._task])
+        assert self._task.cancelled()
+
+
+async def until(condition) -> None:
+    async with asyncio.timeout(SAFETY_S):
+        while not condition():
+            await asyncio.sleep(0)
+
+
+def config_for(ground: Ground, *links: str, first: str = "udpin://127.0.0.1:0") -> Config:
+    """Input on the first link, output to the ground, an attitude for every epoch."""
+    array = f"{{name: array, url: '{first}', emit: {{}}}}"
+    output = f"{{name: ground, url: 'udpout://127.0.0.1:{ground.port}'}}"
+    rates = "emit={ATTITUDE_QUATERNION: 10000, GPS_HEADING_STATUS: 10, ARRAY_STATUS: 2}"
+    return load(None, [rates, f"links=[{', '.join([array, output, *links])}]"])
+
+
+async def feed(ground: Ground, service: Service, sent: list[list[bytes]]) -> list[Frame]:
+    """Send burst by burst over UDP; wait for the attitude of every epoch."""
+    link = service.links[0]
+    assert isinstance(link, UdpInLink)
+    host, _, port = link.address.partition(":")
+    heard = []
+    for burst in sent:
+        for raw in burst:
+            ground.transport.sendto(raw, (host, int(port)))
+        if is_epoch(burst):
+            heard.append(await ground.next("ATTITUDE_QUATERNION"))
+    return heard
+
+
+def outputs(heard: list[Frame]) -> list[tuple[int, bytes]]:
+    return [(f.message_id, f.payload) for f in heard if f.message_id != IDS["HEARTBEAT"]]
+
+
+def replayed(config: Config, log: Path) -> list[tuple[int, bytes]]:
+    file = io.BytesIO()
+    output = OutputLog(config, file)
+    for received_us, estimate in Replay(config, log, Selection()).estimates():
+        output.write(estimate, received_us)
+    return outputs([logged.frame for logged in TlogReader([file.getvalue()])])
+
+
+async def test_every_epoch_gives_an_attitude_that_pymavlink_reads(ground):
+    async with Running(config_for(ground), up=2) as service:
+        heard = await feed(ground, service, bursts())
+    decoder = public.MAVLink(None)
+    messages = [decoder.parse_buffer(frame.raw)[0] for frame in heard]
+    assert [m.time_boot_ms for m in messages] == [1000 + 10 * k for k in range(EPOCHS)]
+    for message in messages:
+        norm = (message.q1**2 + message.q2**2 + message.q3**2 + message.q4**2) ** 0.5
+        assert norm == pytest.approx(1.0, abs=1e-6)
+        assert list(message.repr_offset_q) == [0, 0, 0, 0]
+        assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
+
+
+async def test_a_recording_replays_to_the_same_outputs_bit_for_bit(ground, tmp_path):
+    recording = tmp_path / "drive.tlog"
+    config = config_for(ground, f"{{name: recording, url: 'tlog://{recording}'}}")
+    async with Running(config, up=3) as service:
+        await feed(ground, service, bursts())
+        assert service.pipeline.assembler.counts["epochs"] == EPOCHS
+    live = outputs(ground.heard)
+    assert len(live) > EPOCHS
+    assert replayed(config, recording) == live
+
+
+async def test_heartbeat_tells_whether_epochs_come(ground):
+    async with Running(config_for(ground), up=2):
+        heartbeat = public.MAVLink(None).parse_buffer((await ground.next("HEARTBEAT")).raw)[0]
+    assert heartbeat.type == public.MAV_TYPE_ONBOARD_CONTROLLER
+    assert heartbeat.autopilot == public.MAV_AUTOPILOT_INVALID
+    assert heartbeat.system_status == public.MAV_STATE_BOOT
+
+
+async def test_garbage_from_one_peer_costs_another_nothing(ground):
+    sent = bursts()
+    async with Running(config_for(ground), up=2) as service:
+        host, _, port = service.links[0].address.partition(":")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            for k, burst in enumerate(sent):
+                stranger.sendto(bytes([0xFD, 200, k % 256]) * 20, (host, int(port)))
+                await feed(ground, service, [burst])
+        counts = service.pipeline.assembler.counts
+        assert (counts["epochs"], counts["incomplete"]) == (EPOCHS, 0)
+        assert service.dropped
+
+
+async def test_a_serial_array_that_is_unplugged_comes_back_while_other_links_go_on(
+    ground, tmp_path
+):
+    device = tmp_path / "ttyARRAY"  # not there yet
+    udp = "{name: gps, url: 'udpin://127.0.0.1:0', emit: {}}"
+    config = config_for(ground, udp, first=f"serial://{device}:3000000")
+    epochs = [burst for burst in bursts() if is_epoch(burst)]
+    info = bursts()[0][:1]
+
+    def plug() -> int:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        device.unlink(missing_ok=True)
+        device.symlink_to(os.ttyname(slave))
+        os.close(slave)
+        return master
+
+    async with Running(config, up=0) as service:
+        serial, _, other = service.links
+        await until(lambda: other.counts.connections == 1)
+        for plugged in (1, 2):
+            master = plug()
+            await until(lambda n=plugged: serial.counts.connections == n)
+            half = epochs[: EPOCHS // 2] if plugged == 1 else epochs[EPOCHS // 2 :]
+            for burst in half:
+                os.write(master, b"".join([*info, *burst]))
+                await ground.next("ATTITUDE_QUATERNION")
+            os.close(master)
+        assert service.pipeline.assembler.counts["epochs"] == EPOCHS
+        assert other.counts.connections == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+async def test_a_signal_ends_the_daemon_cleanly(ground, number):
+    links = f"links=[{{name: ground, url: 'udpout://127.0.0.1:{ground.port}'}}]"
+    command = [sys.executable, "-m", "risaf_link.cli", "run", "--set", links]
+    daemon = await asyncio.create_subprocess_exec(*command, stderr=subprocess.PIPE)
+    await ground.next("HEARTBEAT")
+    daemon.send_signal(number)
+    _, complaint = await asyncio.wait_for(daemon.communicate(), SAFETY_S)
+    assert (daemon.returncode, complaint) == (0, b"")
