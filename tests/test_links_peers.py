@@ -7,7 +7,7 @@ import socket
 from collections.abc import Callable, Iterator
 
 import pytest
-from test_links import FRAME, HOST, SOON, port_of, running, until
+from test_links import FRAME, HOST, SOON, port_of, running, told, until
 
 from risaf_link.links import TcpInLink, TcpOutLink, UdpInLink, tcp, udp
 
@@ -78,7 +78,7 @@ async def test_a_udp_peer_silent_for_a_minute_is_forgotten(
         assert await receive_from(peer) == b"kept"
         assert link.counts.dropped_out == 1
     name = f"{HOST}:{peer.getsockname()[1]}"
-    assert caplog.messages[1:] == [f"ground: peer {name}: new", f"ground: peer {name}: forgotten"]
+    assert told(caplog)[1:] == [f"ground: peer {name}: new", f"ground: peer {name}: forgotten"]
 
 
 async def test_garbage_and_empty_datagrams_are_survived(
@@ -153,4 +153,4 @@ async def test_one_tcp_client_too_many_is_refused(
                 await until(lambda: second.counts.connections == 2)  # was closed, tried again
                 first.send(b"2")
                 await until(lambda: inbox.stream == b"12")
-    assert "ground: no more than 1 peers" in caplog.messages
+    assert "ground: no more than 1 peers" in told(caplog)

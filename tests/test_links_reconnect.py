@@ -8,7 +8,19 @@ import socket
 from pathlib import Path
 
 import pytest
-from test_links import FRAME, HOST, SOON, Device, Inbox, device, free_port, port_of, running, until
+from test_links import (
+    FRAME,
+    HOST,
+    SOON,
+    Device,
+    Inbox,
+    device,
+    free_port,
+    port_of,
+    running,
+    told,
+    until,
+)
 
 from risaf_link.links import Link, SerialLink, TcpInLink, TcpOutLink, UdpInLink, UdpOutLink, tcp
 from risaf_link.links.link import Backoff, Connection
@@ -111,7 +123,7 @@ async def test_a_udp_peer_that_is_not_there_is_survived_quietly(
             peer.sendto(b"reply", sender)
             await until(lambda: inbox.stream == b"reply")
     assert data == FRAME
-    assert caplog.messages == [f"ground: up: {HOST}:{address[1]}"]
+    assert told(caplog) == [f"ground: up: {HOST}:{address[1]}"]
 
 
 async def test_a_udp_socket_in_trouble_is_opened_again(free_port: int) -> None:
@@ -212,7 +224,7 @@ async def test_the_reason_is_logged_once(
 ) -> None:
     caplog.set_level(logging.INFO, "risaf_link")
     await delays_of(["absent", "absent", "locked", b"bytes", "absent", "absent"], monkeypatch)
-    assert caplog.messages == [
+    assert told(caplog) == [
         "link: down: absent",
         "link: down: locked",
         "link: up: there",

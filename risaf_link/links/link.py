@@ -109,6 +109,8 @@ class Link(ABC):
                 await self._hold(connection)
             except OSError as error:
                 reason = str(error) or type(error).__name__
+            finally:
+                connection.lost.cancel()  # a transport that still closes has nobody to tell
             if connection.failure is not None:
                 raise connection.failure
             if connection.up_s is not None or reason != told:

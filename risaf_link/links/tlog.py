@@ -1,9 +1,4 @@
-"""A recording of what was received and sent, as a ground station writes it.
-
-A record is the time, eight bytes, big endian, in microseconds since 1970, then the frame. The two
-low bits of the time say which link the frame went over. As MAVProxy does we write 3 for what we
-sent, and 0 for what we received.
-"""
+"""A recording of what was received and sent, as a ground station writes it."""
 
 import asyncio
 import contextlib
@@ -15,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link, Receive
+from risaf_link.mavlink.tlog import RECEIVED, SENT, record
 
-RECEIVED, SENT = 0, 3
 MOST_WAITING = 65536  # records
 FLUSH_S = 1.0
 
@@ -87,7 +82,7 @@ class TlogLink(Link):
         if len(self._waiting) == MOST_WAITING:
             self.counts.dropped_out += 1
         else:
-            self._waiting.append((time_us & ~3 | link).to_bytes(8, "big") + raw)
+            self._waiting.append(record(time_us, raw, link))
 
     async def run(self, receive: Receive) -> None:
         """Write what was and will be recorded until cancelled; trouble with the file is retried."""
