@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 from risaf_link.config import Config, LinkParameters, load_calibration
+from risaf_link.core.estimate import Estimate
 from risaf_link.links import Link, TlogLink, open_link
 from risaf_link.mavlink.frame import FrameParser
 from risaf_link.mavlink.telemetry import ComponentState, Emitter
@@ -62,6 +63,7 @@ class Service:
         self._recordings = [link for link, _ in self._ports if isinstance(link, TlogLink)]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
         self._frames = 0
+        self._received_us = 0
         self._mismatch = ""
 
     @property
@@ -81,7 +83,10 @@ class Service:
             async with asyncio.TaskGroup() as tasks:
                 for link in self.links:
                     tasks.create_task(link.run(partial(self._receive, link)))
-                tasks.create_task(self._beat())
+                try:
+                    await self._beat()
+                finally:  # the links are still open
+                    self._send(self.pipeline.flush(self._received_us))
         finally:
             counts = self.pipeline.assembler.counts
             _log.info("ended: %d frames, %d epochs", self._frames, counts["epochs"])
@@ -93,17 +98,19 @@ class Service:
 
     def _receive(self, link: Link, data: bytes, peer: str) -> None:
         """Take what came over a link, and send what comes of it."""
-        received_us = self._clock_us() & ~3  # as a recording keeps it
+        self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
         for frame in self._parser(link.name, peer).receive_data(data):
             self._frames += 1
             for recording in self._recordings:
                 recording.record(received_us, frame.raw)
-            for estimate in self.pipeline.step(frame, received_us):
-                for port, emitter in self._ports:
-                    if emitter:
-                        for raw in emitter.emit(estimate):
-                            port.send(raw)
+            self._send(self.pipeline.step(frame, received_us))
         self._tell_mismatch()
+
+    def _send(self, estimates: list[Estimate]) -> None:
+        for estimate in estimates:
+            for link, emitter in self._ports:
+                for raw in emitter.emit(estimate) if emitter else ():
+                    link.send(raw)
 
     def _parser(self, link: str, peer: str) -> FrameParser:
         parser = self._parsers.pop((link, peer), None) or FrameParser()
@@ -126,7 +133,7 @@ class Service:
             still_s = 0.0 if progress != epochs else still_s + HEARTBEAT_S
             epochs = progress
             state = ComponentState.ACTIVE if still_s < STALLED_S else ComponentState.CRITICAL
-            for port, emitter in self._ports:
+            for link, emitter in self._ports:
                 if emitter:
-                    port.send(emitter.heartbeat(state if epochs else ComponentState.BOOT))
+                    link.send(emitter.heartbeat(state if epochs else ComponentState.BOOT))
             await asyncio.sleep(HEARTBEAT_S)

@@ -1,0 +1,160 @@
+"""Frames in, estimates out: what the estimator says when this and that happens."""
+
+import math
+
+import numpy as np
+import pytest
+from vehicle import Vehicle
+
+from risaf_link.core.estimate import Estimate
+from risaf_link.core.heading import HeadingState
+from risaf_link.mavlink import risaf
+from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.telemetry import Emitter
+from risaf_link.pipeline import Pipeline, PipelineParameters
+
+OWN = (1, 191)
+PERIOD_US = 10_000
+
+
+class Drive:
+    """A pipeline and a vehicle that feeds it, sample by sample; time is the vehicle's."""
+
+    def __init__(self, sensors: int = 5) -> None:
+        self.vehicle = Vehicle(sensors)
+        self.pipeline = Pipeline(PipelineParameters(), OWN)
+        self.time_us = 5_000_000
+        self.take(self.vehicle.info())
+
+    def take(self, frame: Frame) -> list[Estimate]:
+        return self.pipeline.step(frame, self.time_us)
+
+    def go(self, seconds: float, rate_z: float = 0.0, course: float | None = None) -> Estimate:
+        """Drive on; with a course there is a fix five times a second."""
+        for _ in range(round(seconds * 100)):
+            self.time_us += PERIOD_US
+            if course is not None and self.time_us % 200_000 == 0:
+                self.take(self.vehicle.fix(self.time_us, course))
+            (estimate,) = self.take(self.vehicle.epoch(self.time_us, (0, 0, rate_z)))
+        return estimate
+
+
+@pytest.fixture
+def drive() -> Drive:
+    return Drive()
+
+
+def test_yaw_is_unknown_until_the_first_heading(drive):
+    before = drive.go(1)
+    assert (before.heading.state, before.attitude.aligned) == (HeadingState.NO_FIX, False)
+    assert before.heading.yaw_std == math.pi
+    after = drive.go(1, course=2.0)
+    assert (after.heading.state, after.attitude.resets) == (HeadingState.FUSING, 1)
+    assert after.heading.yaw == pytest.approx(2.0, abs=1e-3)
+
+
+def test_dead_reckoning_carries_the_heading_on(drive):
+    drive.go(10, course=3.0)
+    estimate = drive.go(10, rate_z=math.radians(9))
+    assert estimate.heading.state is HeadingState.DEAD_RECKONING
+    assert estimate.heading.time_since_fused == pytest.approx(10, abs=0.21)
+    assert estimate.heading.yaw == pytest.approx(3.0 + math.pi / 2 - math.tau, abs=0.02)
+
+
+def test_a_slow_vehicle_has_a_fix_but_no_heading(drive):
+    drive.take(drive.vehicle.fix(drive.time_us, course=1.0, speed=0.5))
+    assert drive.go(0.1).heading.state is HeadingState.TOO_SLOW
+
+
+def test_a_heading_that_jumps_is_rejected_and_believed_only_after_a_while(drive):
+    drive.go(20, course=0.5)
+    rejecting = drive.go(5, course=-2.0)
+    assert rejecting.heading.state is HeadingState.REJECTING
+    assert rejecting.heading.yaw == pytest.approx(0.5, abs=0.02)
+    assert rejecting.heading.rejected_count == 25
+    assert rejecting.attitude.resets == 1
+    later = drive.go(5, course=-2.0)
+    assert later.attitude.resets == 2
+    assert later.heading.yaw == pytest.approx(-2.0, abs=0.02)
+
+
+def test_a_receiver_that_repeats_its_last_fix_is_gone(drive):
+    drive.go(10, course=1.0)
+    stale = drive.vehicle.fix(drive.time_us, course=1.0)
+    for _ in range(300):
+        drive.take(stale)
+        estimate = drive.go(0.01)
+    assert estimate.heading.state is HeadingState.DEAD_RECKONING
+
+
+def test_an_epoch_without_any_reading_holds_the_attitude_and_loses_no_time(drive):
+    drive.go(5, course=1.0)
+    rate = math.radians(10)
+    before = drive.go(1, rate_z=rate)
+    drive.time_us += PERIOD_US
+    (blind,) = drive.take(drive.vehicle.epoch(drive.time_us, math.nan))
+    assert np.isnan(blind.fused.rate_b).all()
+    assert blind.attitude.q_nb == pytest.approx(before.attitude.q_nb)
+    after = drive.go(0.01, rate_z=rate)
+    assert after.heading.yaw - before.heading.yaw == pytest.approx(0.02 * rate, rel=0.01)
+
+
+def test_nothing_that_the_service_sent_itself_is_taken_for_input(drive):
+    drive.go(1)
+    assert drive.take(drive.vehicle.epoch(drive.time_us + PERIOD_US, component=OWN[1])) == []
+    assert drive.pipeline.ingest.counts["own"] == 1
+
+
+def test_a_reboot_keeps_the_heading(drive):
+    before = drive.go(10, course=1.0)
+    received_us = drive.time_us
+    drive.time_us = 100_000
+    frame = drive.vehicle.epoch(drive.time_us)
+    (after,) = drive.pipeline.step(frame, received_us + 2_000_000)
+    assert after.time_us == 100_000
+    assert after.elapsed - before.elapsed == pytest.approx(2.0)
+    assert after.heading.yaw == pytest.approx(before.heading.yaw, abs=0.01)
+    assert drive.pipeline.assembler.counts["clock_resets"] == 1
+
+
+def test_boot_time_is_the_autopilots_for_an_array_with_a_clock_of_its_own(drive):
+    heartbeat = {"autopilot": 3, "base_mode": 0, "custom_mode": 0, "system_status": 4}
+    drive.take(drive.vehicle.frame("HEARTBEAT", type=10, mavlink_version=3, **heartbeat))
+    drive.go(0.5)
+    boot_ms = 1_000_000 + drive.time_us // 1000
+    drive.take(drive.vehicle.frame("SYSTEM_TIME", time_unix_usec=0, time_boot_ms=boot_ms))
+    estimate = drive.go(0.5)
+    assert estimate.time_us == drive.time_us
+    assert estimate.boot_us == drive.time_us + 1_000_000_000
+    (frame,) = Emitter({"ATTITUDE_QUATERNION": 100.0}, *OWN).emit(estimate)
+    assert int.from_bytes(frame[10:14], "little") == estimate.boot_us // 1000
+
+
+def test_the_status_messages_say_what_the_estimate_says(drive):
+    drive.go(10, course=1.0)
+    estimate = drive.go(3)
+    emitter = Emitter({"GPS_HEADING_STATUS": 5.0, "ARRAY_STATUS": 1.0}, *OWN)
+    decoder = risaf.MAVLink(None)
+    status, array = (decoder.parse_buffer(raw)[0] for raw in emitter.emit(estimate))
+    assert (status.get_type(), array.get_type()) == ("GPS_HEADING_STATUS", "ARRAY_STATUS")
+    assert status.time_usec == array.time_usec == drive.time_us
+    assert status.heading == pytest.approx(1.0, abs=1e-4)
+    assert status.test_ratio == pytest.approx(
+        abs(status.innovation) / (3.0 * status.innovation_std), rel=1e-5, abs=1e-9
+    )
+    assert status.yaw == pytest.approx(estimate.attitude.euler[2], abs=1e-6)
+    assert status.speed == 10.0
+    assert (status.fused_count, status.rejected_count) == (50, 0)
+    assert status.state == risaf.RISAF_HEADING_STATE_DEAD_RECKONING
+    assert status.source == risaf.RISAF_HEADING_SOURCE_VELOCITY
+    assert array.active == [5, 5, 5]
+    assert (array.sensors_expected, array.sensors_valid, array.healthy) == (5, 5, 5)
+    assert (array.epochs, array.epochs_incomplete, array.samples_lost) == (1300, 0, 0)
+
+
+def test_messages_are_thinned_out_on_the_estimates_own_time(drive):
+    emitter = Emitter({"ATTITUDE_QUATERNION": 20.0}, *OWN)
+    drive.go(0.04)
+    sent = [len(emitter.emit(drive.go(0.01))) for _ in range(1000)]
+    assert sum(sent) == 200
+    assert {sum(sent[k : k + 5]) for k in range(0, 1000, 5)} == {1}
