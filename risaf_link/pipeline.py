@@ -10,7 +10,7 @@ that a live run that is recorded and replayed gives the same estimates, bit for 
 from dataclasses import replace
 
 import numpy as np
-from msgspec import Struct, field
+from msgspec import Struct, field, structs
 
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.attitude import FILTERS, AttitudeParameters
@@ -59,8 +59,9 @@ class Pipeline:
         calibration: ArrayCalibration | None = None,
     ) -> None:
         p = parameters
+        sensors = p.array.sensors or (len(calibration.gyros) if calibration else 0)
         self.ingest = Ingest(p.array, p.gps, own)
-        self.assembler = EpochAssembler(p.array)
+        self.assembler = EpochAssembler(structs.replace(p.array, sensors=sensors))
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
         self._clock = VehicleClock()

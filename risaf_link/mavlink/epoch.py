@@ -1,37 +1,41 @@
-"""Chunks of samples -> whole epochs, in order; late, missing and duplicate ones are counted.
+"""Chunks of samples -> whole epochs, in order; what is late, missing or duplicate is counted.
 
-An epoch is handed on as soon as it is whole and all before it are. It waits for a missing chunk no
-longer than `max_wait` of the array's own time; then it goes on with what it has.
+What the gyros read at one instant is an epoch. The rules:
 
-The number of sensors is taken from who knows it: the configuration, the calibration or the array
-itself (IMU_ARRAY_INFO); otherwise it is the largest seen. It grows at once, and shrinks when the
-last sensors have been silent for `SHRINK_AFTER` epochs.
-
-Time is the array's. When it jumps (the array was rebooted, or its clock was set) the open epochs
-are handed on, the jump is counted, and the length of the step is taken from the arrival times.
+1. An epoch is handed on when it is whole and follows directly on the one before. Else it waits for
+   what is missing, but no longer than `max_wait` of the array's own time. The first one waits that
+   long in any case, unless the array has said how many sensors it has.
+2. An epoch is whole when all sensors are there that came, of late, more than half as often as the
+   most regular one. So neither slow sensors nor silent ones hold up the others.
+3. Accelerometers may be slower than gyros, or read at instants of their own. An epoch takes along
+   what they read at its instant and, of those that did not, the newest reading before it that no
+   other epoch has taken.
+4. The array has as many sensors as it says (IMU_ARRAY_INFO) or as the configuration says, and at
+   least as many as have come. It grows at once; it shrinks when the last sensors have been silent
+   for `SHRINK_AFTER` epochs.
+5. Time is the array's. A chunk whose time is far off is set aside. When several in a row are, or
+   nothing else has arrived for long, the clock has jumped (the array was rebooted, or its clock was
+   set): what is open is handed on, and the length of the step is taken from the arrival times.
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass
-from statistics import median
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
-from numpy.typing import NDArray
 
 from risaf_link.core.fusion import Epoch
 from risaf_link.core.rotation import Floats
+from risaf_link.mavlink.roster import Roster, fitted
 
 Encoding = Literal["GYRO_ARRAY", "DEBUG_FLOAT_ARRAY", "IMU"]
 
-JUMP_US = 1_000_000  # a step back of more is a new clock, not a late frame
-SHRINK_AFTER = 200  # epochs
-REMEMBERED = 64  # epochs handed on, to tell late chunks from duplicates
-FIRST_TOLERANCE_US = 2_000  # of one instant, before the sample period is known
-REVIEW = 32  # epochs, after which it is reviewed what an epoch waits for
-MAX_OPEN = 64  # epochs
-MAX_SENSORS = 4096
+MAX_SENSORS = 1024
+MAX_OPEN = 64  # instants
+REVIEW = 128  # epochs, after which it is reviewed whom an epoch waits for
+SHRINK_AFTER = 8 * REVIEW
+JUMP_US = 1_000_000  # more is far off
+BELIEVED = 4  # chunks far off in a row
 
 
 class ArrayParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,8 +59,7 @@ class Source(NamedTuple):
     array_id: int
 
 
-@dataclass(frozen=True, slots=True)
-class GyroChunk:
+class GyroChunk(Struct, frozen=True):  # like Frame: there are hundreds a second
     """Readings of some sensors of an array at one instant, as one frame carries them."""
 
     source: Source
@@ -67,96 +70,17 @@ class GyroChunk:
     forces_s: Floats  # (m, 3) m/s^2, likewise
     sequence: int | None = None  # number of the epoch, modulo 65536
     sensors: int = 0  # gyros that the array says it has; 0: it does not say
-    loose: bool = False  # stamps within one epoch differ by up to half a sample period
-    padded: bool = False  # NaN behind the last reading is padding
+    tolerance_us: int = 0  # two stamps that differ by less may be one instant
 
+    @property
+    def end(self) -> int:
+        """Index behind the last sensor."""
+        return self.first_sensor + max(len(self.rates_s), len(self.forces_s))
 
-@dataclass
-class _Readings:
-    """What has come of one quantity in one epoch."""
-
-    values: Floats
-    came: NDArray[np.bool_]
-
-    @classmethod
-    def none(cls, size: int) -> "_Readings":
-        return cls(np.full((size, 3), np.nan), np.zeros(size, dtype=bool))
-
-    def put(self, first: int, values: Floats) -> bool:
-        """Take values for sensors from `first` on; False if any of them had come before."""
-        end = first + len(values)
-        if end > len(self.came):
-            grown = _Readings.none(end)
-            grown.values[: len(self.came)] = self.values
-            grown.came[: len(self.came)] = self.came
-            self.values, self.came = grown.values, grown.came
-        if self.came[first:end].any():
-            return False
-        self.values[first:end] = values
-        self.came[first:end] = True
-        return True
-
-    def sized(self, size: int) -> Floats:
-        """Fit the values to `size` sensors, NaN where nothing came."""
-        if size == len(self.values):
-            return self.values
-        fitted = np.full((size, 3), np.nan)
-        fitted[: len(self.values)] = self.values[:size]
-        return fitted
-
-
-@dataclass
-class _OpenEpoch:
-    time_us: int
-    received_us: int
-    sequence: int | None
-    gyros: _Readings
-    accels: _Readings
-
-
-@dataclass
-class _Size:
-    """How many sensors of one kind there are, and whether an epoch has to wait for them."""
-
-    expected: int = 0
-    awaited: bool = False
-    _told: int = 0
-    _seen: int = 0  # since the last review
-    _instants: int = 0  # likewise
-    _epochs: int = 0  # likewise
-    _last_us: int = -1
-
-    def tell(self, size: int) -> bool:
-        """Believe what the array says; True if that is a change."""
-        if size in (0, self._told):
-            return False
-        changed = self.expected not in (0, size)
-        self._told = self.expected = self._seen = size
-        return changed
-
-    def see(self, size: int, time_us: int) -> bool:
-        """Take note of the highest sensor in a chunk; True if there are more than expected."""
-        self._seen = max(self._seen, size)
-        self._instants += time_us != self._last_us
-        self._last_us = time_us
-        if not 0 < self.expected < size:
-            return False
-        self.expected = size
-        return True
-
-    def end_epoch(self) -> bool:
-        """Review at times; True if there are fewer than expected."""
-        self._epochs += 1
-        self.expected = self.expected or self._seen
-        if self._epochs == 1 or self._epochs % REVIEW == 0:
-            self.awaited = 2 * self._instants > min(self._epochs, REVIEW)
-            self._instants = 0
-        if self._epochs < SHRINK_AFTER:
-            return False
-        shrinks = self._told == 0 and self._seen < self.expected
-        self.expected = self._seen if shrinks else self.expected
-        self._seen = self._epochs = 0
-        return shrinks
+    @property
+    def samples(self) -> int:
+        """How many readings of one sensor there are."""
+        return len(self.rates_s) + len(self.forces_s)
 
 
 class EpochAssembler:
@@ -165,9 +89,10 @@ class EpochAssembler:
     Attributes
     ----------
     counts : Counter
-        `epochs`, `incomplete` epochs, `samples_lost`; chunks `late`, `duplicate`, `out_of_range`;
-        instants `without_gyros`; `clock_resets` (back), `clock_jumps` (ahead), `size_changes`,
-        `source_changes`.
+        `epochs`, and those that were `incomplete`; `size_changes` of the array, `source_changes`,
+        `clock_resets` (back), `clock_jumps` (ahead); of samples, that is readings of one sensor:
+        `samples_lost` (of gyros, that never came), `late`, `duplicate`, `astray` (far off),
+        `unclaimed` (of accelerometers, no epoch came for them), `out_of_range`.
     """
 
     def __init__(self, parameters: ArrayParameters) -> None:
@@ -175,15 +100,20 @@ class EpochAssembler:
         self._parameters = parameters
         self._max_wait_us = round(parameters.max_wait * 1e6)
         self._source: Source | None = None
-        self._last: _OpenEpoch | None = None  # handed on
-        self._jumped = False  # the clock, since then
+        self._gyros, self._accels = Roster(parameters.sensors), Roster()
+        self._begun_by: dict[int, GyroChunk] = {}  # every epoch that waits
+        self._newest: GyroChunk | None = None
+        self._astray: list[GyroChunk] = []
+        self._last: GyroChunk | None = None  # began the last epoch, by the present clock
+        self._last_received_us: int | None = None  # likewise, by any clock
+        self._last_size = 0
         self._steps_us: deque[int] = deque(maxlen=15)
-        self._start(None)
+        self._period_us = 0
 
     @property
     def sensors(self) -> int:
         """How many gyros the array has, as far as is known."""
-        return self._gyros.expected
+        return self._gyros.size
 
     @property
     def source(self) -> Source | None:
@@ -191,163 +121,212 @@ class EpochAssembler:
         return self._source
 
     def add(self, chunk: GyroChunk) -> list[Epoch]:
-        """Take one chunk; hand on what is whole now, in order."""
-        if chunk.first_sensor + max(len(chunk.rates_s), len(chunk.forces_s)) > MAX_SENSORS:
-            self.counts["out_of_range"] += 1
+        """Take one chunk; hand on what is ready now, in order."""
+        if chunk.end > MAX_SENSORS:
+            self.counts["out_of_range"] += chunk.samples
             return []
-        epochs = self._follow(chunk)
-        self._learn_sizes(chunk)
-        epoch = self._epoch_of(chunk)
-        if epoch is None:
-            return epochs
-        new = epoch.gyros.put(chunk.first_sensor, chunk.rates_s)
-        new &= epoch.accels.put(chunk.first_sensor, chunk.forces_s)
-        self.counts["duplicate"] += not new
-        return epochs + self._ready()
+        if chunk.source != self._source:
+            return self._change_source(chunk) + self._take(chunk)
+        ahead_us, passed_us = self._since_newest(chunk)
+        if -JUMP_US <= ahead_us <= passed_us + JUMP_US:
+            self._drop_astray()
+            return self._take(chunk)
+        self._astray.append(chunk)
+        if len(self._astray) < BELIEVED and passed_us <= JUMP_US:
+            return []
+        return self._change_clock("clock_jumps" if ahead_us > 0 else "clock_resets")
 
     def flush(self) -> list[Epoch]:
         """Hand on all that is open."""
-        return [epoch for time_us in sorted(self._open) for epoch in self._close(time_us)]
-
-    def _start(self, source: Source | None) -> None:
-        """Start anew on an array of which nothing is known."""
-        self._source = source
-        self._gyros, self._accels = _Size(), _Size()
-        self._gyros.tell(self._parameters.sensors)
-        self._open: dict[int, _OpenEpoch] = {}
-        self._closed: deque[_OpenEpoch] = deque(maxlen=REMEMBERED)
-        self._newest_us = self._newest_received_us = 0
-
-    def _follow(self, chunk: GyroChunk) -> list[Epoch]:
-        """Follow the array when another takes its place, or when its clock jumps."""
-        if self._source is None:
-            self._start(chunk.source)
-            self._newest_us, self._newest_received_us = chunk.time_us, chunk.received_us
-        ahead = chunk.time_us - self._newest_us
-        passed = chunk.received_us - self._newest_received_us
-        epochs: list[Epoch] = []
-        if chunk.source != self._source:
-            epochs = self._jump("source_changes")
-            self._start(chunk.source)
-        elif ahead < -JUMP_US:
-            epochs = self._jump("clock_resets")
-        elif ahead > passed + JUMP_US:
-            epochs = self._jump("clock_jumps")
-        if epochs or ahead > 0 or self._jumped:
-            self._newest_us, self._newest_received_us = chunk.time_us, chunk.received_us
+        self._drop_astray()
+        epochs = [self._close(time_us) for time_us in sorted(self._gyros.open)]
+        self._drop_forces(leave=0)
         return epochs
 
-    def _jump(self, reason: str) -> list[Epoch]:
+    # Sources and clocks
+
+    def _change_source(self, chunk: GyroChunk) -> list[Epoch]:
+        """Begin anew with an array of which nothing is known."""
+        if self._source is not None:
+            self.counts["source_changes"] += 1
+        epochs = self._begin_clock(chunk)
+        self._source = chunk.source
+        self._gyros, self._accels = Roster(self._parameters.sensors), Roster()
+        self._steps_us.clear()
+        self._last_size = self._period_us = 0
+        return epochs
+
+    def _since_newest(self, chunk: GyroChunk) -> tuple[int, int]:
+        """How much later than the newest chunk one was read, and how much later it arrived."""
+        newest = self._newest or chunk
+        passed_us = max(0, chunk.received_us - newest.received_us)
+        return chunk.time_us - newest.time_us, passed_us
+
+    def _change_clock(self, reason: str) -> list[Epoch]:
+        """Follow the clock of the chunks that were set aside."""
         self.counts[reason] += 1
+        astray, self._astray = self._astray, []
+        epochs = self._begin_clock(astray[0])
+        return epochs + [epoch for chunk in astray for epoch in self.add(chunk)]
+
+    def _begin_clock(self, chunk: GyroChunk) -> list[Epoch]:
         epochs = self.flush()
-        self._closed.clear()
-        self._jumped = True
+        self._gyros.gone.clear()
+        self._accels.gone.clear()
+        self._newest, self._last = chunk, None
         return epochs
 
-    def _learn_sizes(self, chunk: GyroChunk) -> None:
-        changes = 0
-        if self._parameters.sensors == 0:
-            changes += self._gyros.tell(chunk.sensors)
-        for size, values in ((self._gyros, chunk.rates_s), (self._accels, chunk.forces_s)):
-            if len(values):
-                used = _used(values) if chunk.padded else len(values)
-                changes += size.see(chunk.first_sensor + used, chunk.time_us)
-        self.counts["size_changes"] += changes
+    def _drop_astray(self) -> None:
+        if self._astray:
+            self.counts["astray"] += sum(chunk.samples for chunk in self._astray)
+            self._astray.clear()
 
-    def _epoch_of(self, chunk: GyroChunk) -> _OpenEpoch | None:
-        """The epoch that a chunk belongs to; None (counted) if that was handed on before."""
-        tolerance_us = self._tolerance_us() if chunk.loose else 0
-        for time_us in self._open:
-            if abs(time_us - chunk.time_us) <= tolerance_us:
-                return self._open[time_us]
-        if self._closed and chunk.time_us <= self._closed[-1].time_us + tolerance_us:
-            self.counts["duplicate" if self._is_known(chunk, tolerance_us) else "late"] += 1
-            return None
-        self._open[chunk.time_us] = _OpenEpoch(
-            chunk.time_us,
-            chunk.received_us,
-            chunk.sequence,
-            _Readings.none(self._gyros.expected),
-            _Readings.none(self._accels.expected),
-        )
-        return self._open[chunk.time_us]
+    # Chunks in
 
-    def _is_known(self, chunk: GyroChunk, tolerance_us: int) -> bool:
-        """Whether all readings of a chunk are part of an epoch that was handed on."""
-        gyros = slice(chunk.first_sensor, chunk.first_sensor + len(chunk.rates_s))
-        accels = slice(chunk.first_sensor, chunk.first_sensor + len(chunk.forces_s))
-        return any(
-            len(epoch.gyros.came) >= gyros.stop
-            and len(epoch.accels.came) >= accels.stop
-            and epoch.gyros.came[gyros].all()
-            and epoch.accels.came[accels].all()
-            for epoch in self._closed
-            if abs(epoch.time_us - chunk.time_us) <= tolerance_us
-        )
+    def _take(self, chunk: GyroChunk) -> list[Epoch]:
+        if self._newest is None or chunk.time_us > self._newest.time_us:
+            self._newest = chunk
+        if not self._parameters.sensors:
+            self._gyros.tell(chunk.sensors)
+        time_us = self._instant_of(chunk)
+        if len(chunk.rates_s):
+            self._take_rates(time_us, chunk)
+        if len(chunk.forces_s):
+            self._take_forces(time_us, chunk)
+        return self._ready()
+
+    def _instant_of(self, chunk: GyroChunk) -> int:
+        """When the epoch that a chunk belongs to began."""
+        time_us = chunk.time_us
+        if not chunk.tolerance_us:
+            return time_us
+        known = (*self._gyros.open, *self._gyros.gone)
+        nearest_us = min(known, key=lambda known_us: abs(known_us - time_us), default=time_us)
+        return nearest_us if abs(nearest_us - time_us) < chunk.tolerance_us else time_us
+
+    def _take_rates(self, time_us: int, chunk: GyroChunk) -> None:
+        first, count = chunk.first_sensor, len(chunk.rates_s)
+        self._gyros.see(first + count)
+        gone = self._gyros.gone.get(time_us)
+        if gone is not None:
+            came = gone.mark(first, count)
+            self._gyros.attend(first, came)
+            new = int(np.count_nonzero(came))
+            self.counts["late"] += new
+        elif self._last is not None and time_us <= self._last.time_us:
+            new = count
+            self.counts["late"] += new
+        else:
+            self._begun_by.setdefault(time_us, chunk)
+            new = self._gyros.put(time_us, first, chunk.rates_s)
+        if new < count:
+            self.counts["duplicate"] += count - new
+
+    def _take_forces(self, time_us: int, chunk: GyroChunk) -> None:
+        first, count = chunk.first_sensor, len(chunk.forces_s)
+        self._accels.see(first + count)
+        gone = self._accels.gone.get(time_us)
+        if gone and gone.includes(first, count):
+            self.counts["duplicate"] += count
+            return
+        if time_us in self._gyros.gone:
+            self._accels.attend(first, np.ones(count, dtype=bool))
+        new = self._accels.put(time_us, first, chunk.forces_s)
+        if new < count:
+            self.counts["duplicate"] += count - new
+        self._drop_forces(leave=MAX_OPEN)
+
+    def _drop_forces(self, leave: int) -> None:
+        while len(self._accels.open) > leave:
+            oldest = self._accels.open.pop(min(self._accels.open))
+            self.counts["unclaimed"] += int(np.count_nonzero(oldest.came))
+
+    # Epochs out
 
     def _ready(self) -> list[Epoch]:
         epochs = []
-        while self._open:
-            oldest = self._open[min(self._open)]
-            waited_us = self._newest_us - oldest.time_us
-            overdue = waited_us > self._max_wait_us or len(self._open) > MAX_OPEN
-            if not (overdue or self._is_whole(oldest)):
+        while self._begun_by and self._newest is not None:
+            oldest = self._begun_by[min(self._begun_by)]
+            waited_us = self._newest.time_us - oldest.time_us
+            overdue = waited_us > self._max_wait_us or len(self._begun_by) > MAX_OPEN
+            if not (overdue or self._is_ready(oldest)):
                 break
-            epochs += self._close(oldest.time_us)
+            epochs.append(self._close(oldest.time_us))
         return epochs
 
-    def _is_whole(self, epoch: _OpenEpoch) -> bool:
-        return self._gyros.expected > 0 and all(
-            readings.came[: size.expected].sum() >= size.expected
-            for size, readings in ((self._gyros, epoch.gyros), (self._accels, epoch.accels))
-            if size.awaited or size is self._gyros
+    def _is_ready(self, begun: GyroChunk) -> bool:
+        """Whether an epoch is whole, as far as is known, and follows directly on the one before."""
+        return (
+            (self._last_size > 0 or self._gyros.told > 0)
+            and self._gyros.is_whole(begun.time_us)
+            and self._accels.is_whole(begun.time_us)
+            and self._epochs_before(begun) == 0
         )
 
-    def _close(self, time_us: int) -> list[Epoch]:
-        epoch = self._open.pop(time_us)
-        if not epoch.gyros.came.any():
-            self.counts["without_gyros"] += 1
-            return []
-        self.counts["size_changes"] += self._gyros.end_epoch() + self._accels.end_epoch()
-        expected = self._gyros.expected
-        missing = expected - int(epoch.gyros.came[:expected].sum())
-        dt = self._step(epoch)
+    def _close(self, time_us: int) -> Epoch:
+        begun = self._begun_by.pop(time_us)
+        gyros = self._gyros.close(time_us)
+        self._gyros.attend(0, gyros.came)
+        rates = fitted(gyros.values, max(self._gyros.size, len(gyros.came)), np.nan)
+        forces = self._forces_until(time_us)
+        lost = self._gyros.lost(gyros)
+        self._count(len(rates), lost, self._epochs_before(begun))
+        dt = self._step(begun)
+        self._end_epoch(begun)
+        return Epoch(time_us, dt, rates, forces, lost)
+
+    def _forces_until(self, time_us: int) -> Floats:
+        """Take what the accelerometers read at an instant or, of those that did not, before."""
+        if not self._accels.open:
+            return np.full((self._accels.size, 3), np.nan)
+        if time_us in self._accels.open:
+            self._accels.attend(0, self._accels.open[time_us].came)
+        forces = np.full((self._accels.size, 3), np.nan)
+        missing = np.ones(self._accels.size, dtype=bool)
+        for read_us in sorted((t for t in self._accels.open if t <= time_us), reverse=True):
+            instant = self._accels.close(read_us)
+            came = fitted(instant.came, len(missing), False)
+            taken = np.flatnonzero(came & missing)
+            forces[taken] = instant.values[taken]
+            missing[taken] = False
+            self.counts["late"] += int(np.count_nonzero(came)) - len(taken)
+        return forces
+
+    def _count(self, size: int, lost: int, epochs_lost: int) -> None:
         self.counts["epochs"] += 1
-        self.counts["incomplete"] += missing > 0
-        self.counts["samples_lost"] += missing + expected * self._epochs_between(epoch)
-        self._last, self._jumped = epoch, False
-        self._closed.append(epoch)
-        rates = epoch.gyros.sized(expected)
-        return [Epoch(time_us, dt, rates, epoch.accels.sized(self._accels.expected), missing)]
+        self.counts["incomplete"] += lost > 0
+        self.counts["samples_lost"] += lost + epochs_lost * self._gyros.expected
+        self.counts["size_changes"] += self._last_size not in (0, size)
+        self._last_size = size
 
-    def _step(self, epoch: _OpenEpoch) -> float:
-        """Seconds since the epoch before: by the array's clock, by arrival if that jumped."""
-        if self._last is None:
+    def _step(self, begun: GyroChunk) -> float:
+        """Seconds since the epoch before: by the array's clock, by arrival if that has jumped."""
+        if self._last is not None:
+            return (begun.time_us - self._last.time_us) / 1e6
+        if self._last_received_us is None:
             return 0.0
-        if self._jumped:
-            return max(self._period_us(), epoch.received_us - self._last.received_us) / 1e6
-        return (epoch.time_us - self._last.time_us) / 1e6
+        return max(self._period_us, begun.received_us - self._last_received_us) / 1e6
 
-    def _epochs_between(self, epoch: _OpenEpoch) -> int:
-        """How many epochs are missing between the last one and this; learns the period."""
-        if self._last is None or self._jumped:
+    def _epochs_before(self, begun: GyroChunk) -> int:
+        """How many epochs are missing between the last one and this."""
+        if self._last is None:
             return 0
-        step_us = epoch.time_us - self._last.time_us
-        period_us = self._period_us()
-        self._steps_us.append(step_us)
-        by_time = max(0, round(step_us / period_us) - 1) if period_us else 0
-        if epoch.sequence is None or self._last.sequence is None:
+        step_us = begun.time_us - self._last.time_us
+        by_time = max(0, round(step_us / self._period_us) - 1) if self._period_us else 0
+        if begun.sequence is None or self._last.sequence is None:
             return by_time
-        return min(by_time, (epoch.sequence - self._last.sequence - 1) % 65536)
+        by_number = (begun.sequence - self._last.sequence - 1) % 65536
+        return by_number if by_number <= MAX_OPEN else min(by_number, by_time)
 
-    def _period_us(self) -> int:
-        return round(median(self._steps_us)) if self._steps_us else 0
-
-    def _tolerance_us(self) -> int:
-        return self._period_us() // 2 or FIRST_TOLERANCE_US
-
-
-def _used(values: Floats) -> int:
-    """How many rows there are up to the last reading."""
-    rows = np.flatnonzero(~np.isnan(values).all(axis=1))
-    return int(rows[-1]) + 1 if len(rows) else 0
+    def _end_epoch(self, begun: GyroChunk) -> None:
+        if self._last is not None:
+            self._steps_us.append(begun.time_us - self._last.time_us)
+            self._period_us = sorted(self._steps_us)[len(self._steps_us) // 2]
+        self._last, self._last_received_us = begun, begun.received_us
+        if self.counts["epochs"] % REVIEW == 0:
+            most = self._gyros.attended.max()
+            for roster in (self._gyros, self._accels):
+                roster.review(most)
+        if self.counts["epochs"] % SHRINK_AFTER == 0:
+            for roster in (self._gyros, self._accels):
+                roster.forget_silent()

@@ -24,6 +24,7 @@ DEFAULT_RATES: dict[Message, float] = {
 ONBOARD_CONTROLLER = 18  # MAV_TYPE
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 MAVLINK_VERSION = 3
+UINT32_LIMIT = 2**32 - 1
 
 
 class ComponentState(IntEnum):
@@ -121,9 +122,9 @@ def _array_status(estimate: Estimate) -> dict[str, Any]:
         "time_usec": estimate.boot_us,
         "rate": fused.rate_b,
         "rate_std": np.sqrt(fused.variance),
-        "epochs": array.epochs,
-        "epochs_incomplete": array.epochs_incomplete,
-        "samples_lost": array.samples_lost,
+        "epochs": min(array.epochs, UINT32_LIMIT),
+        "epochs_incomplete": min(array.epochs_incomplete, UINT32_LIMIT),
+        "samples_lost": min(array.samples_lost, UINT32_LIMIT),
         "sensors_expected": array.sensors,
         "sensors_valid": fused.valid,
         "active": fused.active,
