@@ -123,13 +123,14 @@ class Pipeline:
         """Correct the attitude by a GPS fix."""
         motion = self._finder.take(fix, self._elapsed)
         self._monitor.note_motion(motion)
-        if motion.heading is None:
+        heading = motion.heading
+        if heading is None:
             return
-        measured = motion.heading.heading, motion.heading.variance, self._heading.delay
+        measured = heading.heading, heading.variance, self._heading.delay + heading.age
         innovation = self._filter.correct_heading(*measured, self._heading.gate)
         if self._monitor.distrusts_filter and not innovation.fused:
             innovation = self._filter.reset_heading(*measured, self._heading.gate)
-        self._monitor.note_innovation(motion.heading, innovation)
+        self._monitor.note_innovation(heading, innovation)
 
     def _array_status(self, epoch: Epoch) -> ArrayStatus:
         counts, source = self.assembler.counts, self.assembler.source

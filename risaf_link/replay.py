@@ -123,7 +123,7 @@ class Scorer:
             return
         motion = self._finder.take(fix, self._last.elapsed)
         if motion.heading:
-            valid_us = self._last.boot_us - self._delay_us
+            valid_us = self._last.boot_us - self._delay_us - round(motion.heading.age * 1e6)
             self._compare("gps", self._by_boot.at(valid_us), motion.heading.heading)
 
     def _is_due(self, track: YawTrack, time_us: int, _: float) -> bool:

@@ -153,7 +153,10 @@ class TestCalibrationFile:
                 "gyros.0.bias: found [1, 2], expected array of length >= 3",
             ),
             ("gyros: [{}, {skale: 1}]", "gyros.1.skale: unknown key; known: bias, scale, "),
-            ("gyros: [{mounting: [0, 0, 0, 0]}]", "gyros[0].mounting: found [0.0, 0.0, 0.0, 0.0], exp"),
+            (
+                "gyros: [{mounting: [0, 0, 0, 0]}]",
+                "gyros[0].mounting: found [0.0, 0.0, 0.0, 0.0], exp",
+            ),
             ("", "found nothing, expected object"),
         ],
     )

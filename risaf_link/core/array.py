@@ -13,13 +13,15 @@ Vector = Annotated[list[float], Meta(min_length=3, max_length=3)]
 class TriadCalibration(Struct, frozen=True, forbid_unknown_fields=True):
     """What turns a triad's raw reading u into its true value: `R M diag(scale) (u - bias)`.
 
-    Skog et al., "Calibration of a MEMS inertial measurement unit", 2006, writes the same model.
+    The model of Tedaldi, Pretto and Menegatti, "A robust and easy to implement method for IMU
+    calibration without external equipments", ICRA 2014, as their IMU-TK states it
+    (`X' = T K (X - B)`), with the mounting R besides.
     """
 
     bias: Vector = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """rad/s or m/s^2, in the sensor's own axes, as read."""
     scale: Vector = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    """True value per reading, each axis."""
+    """True value per reading, each axis; not 0."""
     misalignment: Annotated[list[float], Meta(min_length=6, max_length=6)] = field(
         default_factory=lambda: [0.0] * 6
     )
@@ -49,12 +51,15 @@ class Calibration:
     Raises
     ------
     ValueError
-        If a mounting is no rotation, or if there are more accelerometers than gyros.
+        In one line: which entry, what was found, what was expected. A value that is not finite, a
+        scale of 0, a mounting that is no rotation, more accelerometers than gyros.
     """
 
     def __init__(self, array: ArrayCalibration) -> None:
         if len(array.accels) > len(array.gyros):
-            raise ValueError(f"accels: {len(array.accels)}, expected at most {len(array.gyros)}")
+            raise ValueError(
+                f"accels: found {len(array.accels)}, expected at most {len(array.gyros)}, as gyros"
+            )
         self._name = array.name
         self._gyros = _Triads("gyros", array.gyros)
         self._accels = _Triads("accels", array.accels)
@@ -65,7 +70,7 @@ class Calibration:
         Parameters
         ----------
         sensors : int
-            Gyros that the array has.
+            Gyros that the array has. There may be fewer than the calibration knows: the first.
         name : str
             Name of the array; empty: not known.
         """
@@ -83,8 +88,9 @@ class Calibration:
         Parameters
         ----------
         rates_s, forces_s : ndarray, shapes (n, 3) and (m, 3)
-            Raw readings, each in its sensor's own axes; NaN where not valid. The first n and m
-            sensors are meant. Accelerometers without a calibration stay as they are.
+            Raw readings, rad/s and m/s^2, each in its sensor's own axes; NaN where not valid. The
+            first n and m sensors are meant; n at most as many as are calibrated. Accelerometers
+            without a calibration stay as they are.
 
         Returns
         -------
@@ -100,21 +106,34 @@ class _Triads:
     """Calibration of all triads of one quantity."""
 
     def __init__(self, what: str, triads: list[TriadCalibration]) -> None:
+        for i, triad in enumerate(triads):
+            _check(f"{what}[{i}]", triad)
         n = len(triads)
         mounting = np.array([t.mounting for t in triads], dtype=float).reshape(n, 4)
-        length = np.linalg.norm(mounting, axis=1)
-        for bad in np.flatnonzero(~((length > 0) & np.isfinite(length))):
-            raise ValueError(f"{what}[{bad}].mounting: {triads[bad].mounting} is no rotation")
+        rotation_bs = matrix_from_quaternion(mounting / np.linalg.norm(mounting, axis=1)[:, None])
         shape = np.tile(np.eye(3), (n, 1, 1))
         shape[:, ~np.eye(3, dtype=bool)] = np.array([t.misalignment for t in triads]).reshape(n, 6)
         scale = np.array([t.scale for t in triads], dtype=float).reshape(n, 3)
         self.bias = np.array([t.bias for t in triads], dtype=float).reshape(n, 3)
-        rotation_bs = matrix_from_quaternion(mounting / length[:, None])
-        self._matrix = (rotation_bs @ shape) * scale[:, None, :]
+        self._matrix = np.moveaxis((rotation_bs @ shape) * scale[:, None, :], 0, 2).copy()
+        self._unrelated = self._matrix == 0.0  # (3, 3, n): to, from, sensor
 
     def apply(self, readings_s: Floats) -> Floats:
-        matrix = self._matrix[: len(readings_s)]
-        centred = readings_s - self.bias[: len(readings_s)]
-        parts = np.where(matrix == 0.0, 0.0, matrix * centred[:, None, :])
-        corrected: Floats = parts.sum(axis=2)
-        return corrected
+        n = len(readings_s)
+        centred = (readings_s - self.bias[:n]).T
+        parts = np.where(self._unrelated[:, :, :n], 0.0, self._matrix[:, :, :n] * centred)
+        corrected: Floats = parts.sum(axis=1)
+        return corrected.T
+
+
+def _check(where: str, triad: TriadCalibration) -> None:
+    for name in triad.__struct_fields__:
+        values = getattr(triad, name)
+        if not np.isfinite(values).all():
+            raise ValueError(f"{where}.{name}: found {values}, expected finite numbers")
+    if 0.0 in triad.scale:
+        raise ValueError(f"{where}.scale: found {triad.scale}, expected numbers other than 0")
+    if not 0.0 < np.linalg.norm(triad.mounting) < np.inf:
+        raise ValueError(
+            f"{where}.mounting: found {triad.mounting}, expected a quaternion, longer than 0"
+        )

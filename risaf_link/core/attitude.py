@@ -18,7 +18,6 @@ from risaf_link.core.rotation import (
     Floats,
     euler_from_quaternion,
     left_matrix,
-    quaternion_from_euler,
     rate_matrix,
     right_matrix,
     wrap,
@@ -28,19 +27,22 @@ from risaf_link.core.rotation import (
 ATTITUDE = slice(0, 4)  # q_nb (w, x, y, z)
 BIAS = slice(4, 7)  # bias of the fused rate, rad/s, body
 
-YAW_HISTORY = 1024  # epochs; a second at 1 kHz
-LONG_STEP = 0.5  # s; over a longer one nothing is known of the rate
-UNKNOWN_RATE = 0.5  # rad/s, standard deviation of what a vehicle may do unseen
+YAW_HISTORY = 4096  # epochs; four seconds at 1 kHz
+LONG_STEP = 1.0  # s that a rate is believed to have lasted
+UNSEEN_TURN = 0.5  # rad/s, standard deviation of a vehicle's turning that no rate tells of
+UNKNOWN_YAW = 0.5  # rad, standard deviation of a yaw that a heading sets instead of correcting it
+
+_I4, _I7 = np.eye(4), np.eye(7)
 
 
 class AttitudeParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """What the attitude filter assumes of the fused rate."""
+    """What the attitude filter assumes of the fused rate, as standard deviations."""
 
     filter: Literal["paper"] = "paper"
-    gyro_noise: Annotated[float, Meta(gt=0)] = 0.003
-    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6
-    initial_bias_std: Annotated[float, Meta(gt=0)] = 0.01
-    initial_tilt_std: Annotated[float, Meta(gt=0)] = 0.05
+    gyro_noise: Annotated[float, Meta(gt=0)] = 0.003  # rad/s a sample, where eq. 8 gives none
+    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6  # rad/s/sqrt(s)
+    initial_bias_std: Annotated[float, Meta(gt=0)] = 0.01  # rad/s
+    initial_tilt_std: Annotated[float, Meta(gt=0)] = 0.05  # rad, roll and pitch
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,27 +88,32 @@ class Innovation:
 class PaperFilter:
     """The 7-state EKF of the paper: quaternion and gyro bias, both additive.
 
-    Yaw is unknown until the first heading sets it; roll and pitch start level, since nothing in
-    this filter measures them.
+    Roll and pitch start level, since nothing in this filter measures them; yaw is unknown until the
+    first heading sets it.
+
+    Beyond the paper: whenever the quaternion is normalised, its covariance is as well; otherwise
+    the error along the quaternion, which is none, would grow without end. A heading sets yaw where
+    yaw is too uncertain for the linear correction. A rate is not believed for longer than
+    `LONG_STEP`.
     """
 
     def __init__(self, parameters: AttitudeParameters) -> None:
-        self._parameters = parameters
+        p = self._parameters = parameters
+        # No array is changed once it is part of a state.
         self._q = np.array([1.0, 0.0, 0.0, 0.0])
         self._bias = np.zeros(3)
         self._rate = np.zeros(3)
-        self._aligned = False
+        angles = np.array([p.initial_tilt_std, p.initial_tilt_std, math.pi])
+        std = np.concatenate([[0.0], angles / 2, np.full(3, p.initial_bias_std)])
+        self._covariance = np.diag(std**2)
+        self._bias_walk = np.diag([0.0] * 4 + [p.bias_walk**2] * 3)  # a second
         self._resets = 0
-        self._covariance = np.zeros((7, 7))
-        self._covariance[BIAS, BIAS] = np.eye(3) * parameters.initial_bias_std**2
-        tilt = parameters.initial_tilt_std
-        self._set_attitude_covariance(tilt, tilt, math.pi)
         self._elapsed = 0.0  # s
         self._yaws: deque[tuple[float, float]] = deque(maxlen=YAW_HISTORY)  # without corrections
         self._yaw_corrections = 0.0  # their sum
 
     def predict(self, fused: FusedRate, dt: float) -> None:
-        """Carry the state on to the time of a fused rate.
+        """Carry the state on to the time of a fused rate: eq. 3 to first order, eq. 9 to 11.
 
         Parameters
         ----------
@@ -114,30 +121,26 @@ class PaperFilter:
             The rate over the time since the state; its variance (eq. 8) is the process noise.
         dt : float
             That time, seconds.
+
+        Raises
+        ------
+        ValueError
+            If a rate or the time is not finite, or the time negative.
         """
-        p = self._parameters
-        self._rate = fused.rate_b - self._bias
-        variance = np.where(np.isnan(fused.variance), p.gyro_noise**2, fused.variance)
-        if dt > LONG_STEP:
-            variance = variance + UNKNOWN_RATE**2
-        transition = np.eye(4) + dt / 2 * rate_matrix(self._rate)  # eq. 10
-        by_rate = dt / 2 * left_matrix(self._q)[:, 1:]  # minus eq. 11: dt/2 G(q)
-        jacobian = np.eye(7)  # eq. 9
-        jacobian[ATTITUDE, ATTITUDE] = transition
-        jacobian[ATTITUDE, BIAS] = -by_rate
-        covariance = jacobian @ self._covariance @ jacobian.T
-        covariance[ATTITUDE, ATTITUDE] += (by_rate * variance) @ by_rate.T
-        covariance[BIAS, BIAS] += np.eye(3) * (p.bias_walk**2 * dt)
-        self._covariance = (covariance + covariance.T) / 2
-        self._q = transition @ self._q  # eq. 3, to first order
-        self._q /= np.linalg.norm(self._q)
+        rate = fused.rate_b - self._bias
+        if not (0.0 <= dt < math.inf and np.isfinite(rate).all()):
+            raise ValueError(
+                f"rate {fused.rate_b} over {dt} s: expected finite ones, the time at least 0"
+            )
+        self._rate = rate
+        self._integrate(rate, _known(fused.variance, self._parameters.gyro_noise**2), dt)
         self._elapsed += dt
         self._yaws.append((self._elapsed, yaw_of(self._q) - self._yaw_corrections))
 
     def correct_heading(
         self, heading: float, variance: float, age: float, gate: float
     ) -> Innovation:
-        """Fuse a heading; the first one sets yaw.
+        """Fuse a heading, section III.C; while yaw is unknown, set it.
 
         Parameters
         ----------
@@ -149,75 +152,97 @@ class PaperFilter:
         gate : float
             Standard deviations of the innovation beyond which a heading is rejected.
         """
-        if not self._aligned:
+        if self._turn_variance() > UNKNOWN_YAW**2:
             return self.reset_heading(heading, variance, age, gate)
         error = wrap(heading - self._yaw_before(age))
         direction = _euler_jacobian(self._q)[2]
         gain = self._covariance[:, ATTITUDE] @ direction
         innovation = Innovation(error, float(direction @ gain[ATTITUDE]) + variance, gate)
         if innovation.fused:
-            gain /= innovation.variance
-            self._correct(gain, error)
-            self._joseph(direction, gain, variance)
+            self._correct(gain / innovation.variance, error, direction, variance)
         return innovation
 
     def reset_heading(self, heading: float, variance: float, age: float, gate: float) -> Innovation:
-        """Set yaw by a heading, whatever it was; roll, pitch and bias stay."""
+        """Set yaw by a heading, whatever it was; roll, pitch and bias stay.
+
+        Parameters are those of `correct_heading`. The error of yaw becomes that of the heading,
+        and independent of all others.
+        """
         error = wrap(heading - self._yaw_before(age))
-        roll, pitch, yaw = euler_from_quaternion(self._q)
-        roll_std, pitch_std, yaw_std = self._euler_std()
-        self._q = quaternion_from_euler(roll, pitch, wrap(yaw + error))
+        innovation = Innovation(error, self._euler_std()[2] ** 2 + variance, gate, reset=True)
+        turn = left_matrix(np.array([math.cos(error / 2), 0.0, 0.0, math.sin(error / 2)]))
+        by_yaw = _by_angles(self._q)[:, 2]
+        keep = _I7.copy()
+        keep[ATTITUDE, ATTITUDE] = turn @ (_I4 - 4 * np.outer(by_yaw, by_yaw))
+        covariance = keep @ self._covariance @ keep.T
+        by_yaw = turn @ by_yaw
+        covariance[ATTITUDE, ATTITUDE] += variance * np.outer(by_yaw, by_yaw)
+        self._covariance = _symmetric(covariance)
+        self._q = turn @ self._q
         self._yaw_corrections += error
-        self._set_attitude_covariance(roll_std, pitch_std, math.sqrt(variance))
-        self._aligned = True
         self._resets += 1
-        return Innovation(error, yaw_std**2 + variance, gate, reset=True)
+        return innovation
 
     def state(self, time_us: int) -> AttitudeState:
         """Read the estimate as of the last predict."""
-        roll_std, pitch_std, yaw_std = self._euler_std()
         return AttitudeState(
             time_us,
-            self._q.copy(),
-            self._rate.copy(),
-            self._bias.copy(),
-            roll_std,
-            pitch_std,
-            yaw_std if self._aligned else math.pi,
-            self._aligned,
+            self._q,
+            self._rate,
+            self._bias,
+            *self._euler_std(),
+            self._resets > 0,
             self._resets,
         )
 
-    def _correct(self, gain: Floats, error: float) -> None:
+    def _integrate(self, rate: Floats, variance: Floats, dt: float) -> None:
+        believed = min(dt, LONG_STEP)
+        transition = _I4 + believed / 2 * rate_matrix(rate)  # eq. 10
+        by_angle = left_matrix(self._q)[:, 1:] / 2  # G(q) / 2
+        self._q, normalise = _normalised(transition @ self._q)
+        by_angle = normalise @ by_angle
+        jacobian = _I7.copy()  # eq. 9
+        jacobian[ATTITUDE, ATTITUDE] = normalise @ transition
+        jacobian[ATTITUDE, BIAS] = -believed * by_angle  # eq. 11
+        covariance = jacobian @ self._covariance @ jacobian.T + self._bias_walk * dt
+        angles = np.minimum(variance * believed**2, math.pi**2)  # beyond, nothing is known
+        covariance[ATTITUDE, ATTITUDE] += (by_angle * angles) @ by_angle.T
+        if dt > believed:
+            covariance[ATTITUDE, ATTITUDE] += self._unseen(dt - believed)
+        self._covariance = _symmetric(covariance)
+
+    def _unseen(self, dt: float) -> Floats:
+        """Covariance of what a vehicle may turn and tilt in a time that no rate tells of."""
+        tilt = self._parameters.initial_tilt_std * min(dt, 1.0)
+        angles = np.array([tilt, tilt, min(UNSEEN_TURN * dt, math.pi)])
+        by_angles = _by_angles(self._q)
+        covariance: Floats = (by_angles * angles**2) @ by_angles.T
+        return covariance
+
+    def _correct(self, gain: Floats, error: float, direction: Floats, variance: float) -> None:
+        """Use a gain; the covariance by the form of Bucy and Joseph, 1968, which stays positive."""
         before = yaw_of(self._q)
-        self._q = self._q + gain[ATTITUDE] * error
-        self._q /= np.linalg.norm(self._q)
+        remaining = _I7.copy()
+        remaining[:, ATTITUDE] -= np.outer(gain, direction)
         self._bias = self._bias + gain[BIAS] * error
+        self._q, normalise = _normalised(self._q + gain[ATTITUDE] * error)
+        remaining[ATTITUDE] = normalise @ remaining[ATTITUDE]
+        gain[ATTITUDE] = normalise @ gain[ATTITUDE]
+        self._covariance = _symmetric(
+            remaining @ self._covariance @ remaining.T + variance * np.outer(gain, gain)
+        )
         self._yaw_corrections += wrap(yaw_of(self._q) - before)
 
-    def _joseph(self, direction: Floats, gain: Floats, variance: float) -> None:
-        """Bucy and Joseph's form of the covariance update: symmetric and positive."""
-        remaining = np.eye(7)
-        remaining[:, ATTITUDE] -= np.outer(gain, direction)
-        covariance = remaining @ self._covariance @ remaining.T
-        self._covariance = covariance + variance * np.outer(gain, gain)
-
-    def _set_attitude_covariance(self, roll_std: float, pitch_std: float, yaw_std: float) -> None:
-        """Make the attitude's errors independent of the bias: small rotations about NED axes.
-
-        Roll and pitch stand for the tilt about north and east; the larger of both is taken.
-        """
-        tilt = max(roll_std, pitch_std) ** 2
-        by_angle = right_matrix(self._q)[:, 1:] / 2
-        self._covariance[ATTITUDE, :] = 0.0
-        self._covariance[:, ATTITUDE] = 0.0
-        self._covariance[ATTITUDE, ATTITUDE] = (by_angle * [tilt, tilt, yaw_std**2]) @ by_angle.T
+    def _turn_variance(self) -> float:
+        """Variance of the attitude's error about the down axis, rad^2."""
+        by_yaw = _by_angles(self._q)[:, 2]
+        return float(16 * by_yaw @ self._covariance[ATTITUDE, ATTITUDE] @ by_yaw)
 
     def _euler_std(self) -> tuple[float, float, float]:
         jacobian = _euler_jacobian(self._q)
         variance = ((jacobian @ self._covariance[ATTITUDE, ATTITUDE]) * jacobian).sum(axis=1)
-        roll, pitch, yaw = np.minimum(np.sqrt(np.maximum(variance, 0.0)), math.pi)
-        return float(roll), float(pitch), float(yaw)
+        roll, pitch, yaw = (min(math.sqrt(max(v, 0.0)), math.pi) for v in variance.tolist())
+        return roll, pitch, yaw
 
     def _yaw_before(self, age: float) -> float:
         """Yaw of `age` seconds ago, interpolated; the oldest known where that is too long ago."""
@@ -235,17 +260,40 @@ class PaperFilter:
 FILTERS: dict[str, type[PaperFilter]] = {"paper": PaperFilter}
 
 
+def _known(variance: Floats, otherwise: float) -> Floats:
+    return np.where(np.isnan(variance), otherwise, variance)
+
+
+def _normalised(q: Floats) -> tuple[Floats, Floats]:
+    """A quaternion brought to unit length, (4,), and its derivative by the one before, (4, 4)."""
+    length = math.sqrt(q @ q)
+    unit = q / length
+    return unit, (_I4 - unit[:, None] * unit) / length
+
+
+def _symmetric(covariance: Floats) -> Floats:
+    return (covariance + covariance.T) / 2
+
+
+def _by_angles(q_nb: Floats) -> Floats:
+    """Derivatives of the quaternion by small rotations about north, east and down, (4, 3).
+
+    Its columns are orthogonal, of length 1/2.
+    """
+    return right_matrix(q_nb)[:, 1:] / 2
+
+
 def _euler_jacobian(q_nb: Floats) -> Floats:
     """Derivatives of roll, pitch and yaw by the quaternion, shape (3, 4).
 
     Those of `euler_from_quaternion`, whose arc tangents do not change with the quaternion's length.
     """
-    w, x, y, z = q_nb
+    w, x, y, z = q_nb.tolist()
     roll = _arctan_gradient(
         2 * (w * x + y * z), w * w - x * x - y * y + z * z, (x, w, z, y), (w, -x, -y, z)
     )
     cosine = math.sqrt(max(1.0 - (2 * (w * y - x * z)) ** 2, 1e-12))
-    pitch = np.array([2 * y, -2 * z, 2 * w, -2 * x]) / cosine
+    pitch = [2 * y / cosine, -2 * z / cosine, 2 * w / cosine, -2 * x / cosine]
     yaw = _arctan_gradient(
         2 * (w * z + x * y), w * w + x * x - y * y - z * z, (z, y, x, w), (w, x, -y, -z)
     )
@@ -254,9 +302,9 @@ def _euler_jacobian(q_nb: Floats) -> Floats:
 
 def _arctan_gradient(
     a: float, b: float, half_da: tuple[float, ...], half_db: tuple[float, ...]
-) -> Floats:
+) -> list[float]:
     """Gradient of atan2(a, b); zero where the angle is undefined (gimbal lock)."""
     square = a * a + b * b
     if square < 1e-12:
-        return np.zeros(4)
-    return 2.0 * (b * np.array(half_da) - a * np.array(half_db)) / square
+        return [0.0] * len(half_da)
+    return [2.0 * (b * da - a * db) / square for da, db in zip(half_da, half_db, strict=True)]

@@ -1,11 +1,14 @@
 """Epoch -> FusedRate: one angular rate from all sensors of an array.
 
 `Risaf` is the method of Hanani and Kipnis, "Robust Extended Kalman Filter for Land Navigation Using
-Massive Array of MEMS IMUs", eq. 5 to 8; equation numbers here are theirs. `Mean` and `Median` are
-what it is compared with.
+Massive Array of MEMS IMUs", section III.B, eq. 5 to 8; equation numbers here are theirs. `Mean` and
+`Median` are what it is compared with.
+
+Inside, the readings stand by channel, shape (3, n), since NumPy is quickest along the last axis. A
+reading that is not finite is not valid.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
@@ -14,13 +17,17 @@ from numpy.typing import NDArray
 
 from risaf_link.core.rotation import Floats
 
+MAD_TO_STD = 1.4826
+"""Makes the median absolute deviation of Gaussian values their standard deviation: Rousseeuw and
+Croux, "Alternatives to the Median Absolute Deviation", JASA 88, 1993."""
+
 
 class FusionParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """How the sensors of an array become one rate."""
 
     method: Literal["risaf", "median", "mean"] = "risaf"
-    alpha: Annotated[float, Meta(ge=0, lt=1)] = 0.995
-    lower_quantile: Annotated[float, Meta(ge=0, le=0.5)] = 0.20
+    alpha: Annotated[float, Meta(ge=0, lt=1)] = 0.995  # eq. 5, an epoch
+    lower_quantile: Annotated[float, Meta(ge=0, le=0.5)] = 0.20  # eq. 6
     upper_quantile: Annotated[float, Meta(ge=0.5, le=1)] = 0.80
 
 
@@ -29,7 +36,7 @@ class Epoch:
     """All readings of one instant."""
 
     time_us: int
-    dt: float  # seconds since the epoch before; NaN at the first
+    dt: float  # seconds since the epoch before; 0 at the first
     rates_b: Floats  # (n, 3) rad/s; NaN: no valid reading
     forces_b: Floats  # (m, 3) specific force, m/s^2; m may be 0
     lost: int  # sensors whose gyro sample never came
@@ -54,44 +61,49 @@ class Fusion(Protocol):
         ...
 
 
-@dataclass
 class Risaf:
     """Robust Inertial Sensor Array Fusion: eq. 5 to 8.
 
-    The relative bias of each sensor against the array's mean is tracked and taken off; per axis,
-    the readings between two quantiles are averaged. Quantiles interpolate linearly between order
-    statistics, a sensor on a threshold is inside. The relative bias of a channel without a valid
-    reading stays as it is. With two sensors neither lies between the quantiles: their mean is
-    taken.
+    Each channel's relative bias against the array's mean is tracked and taken off; of each axis,
+    the readings between two quantiles are averaged.
 
-    Attributes
-    ----------
-    relative_bias : ndarray, shape (n, 3)
-        rad/s; starts from zero.
+    What the paper leaves open: relative biases start from zero; the mean in eq. 5 runs over the
+    channels valid at that epoch, and the relative bias of the others stays as it is; the set of
+    eq. 6 is taken per axis; quantiles interpolate linearly between order statistics, and a sensor
+    on a threshold is inside. Of two sensors neither is: their mean is taken.
     """
 
-    parameters: FusionParameters
-    relative_bias: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    def __init__(self, parameters: FusionParameters) -> None:
+        self._parameters = parameters
+        self._relative_bias = np.zeros((3, 0))
+
+    @property
+    def relative_bias(self) -> Floats:
+        """Relative bias of each sensor, shape (n, 3), rad/s, as of the last epoch."""
+        return self._relative_bias.T
 
     def fuse(self, epoch: Epoch) -> FusedRate:
-        """Fuse one epoch, equations 5 to 8."""
-        p = self.parameters
-        rates = epoch.rates_b
-        self._resize(len(rates))
-        residual = rates - _mean(rates)
-        updated = p.alpha * self.relative_bias + (1.0 - p.alpha) * residual  # eq. 5
-        self.relative_bias = np.where(np.isnan(rates), self.relative_bias, updated)
-        corrected = rates - self.relative_bias
-        lower, upper = quantiles(corrected, p.lower_quantile, p.upper_quantile)
-        inside = (lower <= corrected) & (corrected <= upper)  # eq. 6
-        inside |= ~inside.any(axis=0) & ~np.isnan(corrected)
-        return _mean_of_members(epoch, corrected, inside)  # eq. 7 and 8
+        """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
+        p = self._parameters
+        rates, valid = _channels(epoch)
+        self._resize(rates.shape[1])
+        mean = rates.sum(axis=1, where=valid) / np.maximum(valid.sum(axis=1), 1)
+        residual = rates - mean[:, None]
+        tracked = p.alpha * self._relative_bias + (1.0 - p.alpha) * residual  # eq. 5
+        self._relative_bias = np.where(valid, tracked, self._relative_bias)
+        corrected = rates - self._relative_bias
+        lower, upper = quantiles(corrected, (p.lower_quantile, p.upper_quantile))
+        active = (lower[:, None] <= corrected) & (corrected <= upper[:, None])  # eq. 6
+        if not active.any(axis=1).all():
+            active |= valid & ~active.any(axis=1, keepdims=True)
+        return _mean_of_active(epoch, corrected, active, valid)  # eq. 7 and 8
 
     def _resize(self, n: int) -> None:
-        missing = n - len(self.relative_bias)
-        if missing:
-            new = np.zeros((max(0, missing), 3))
-            self.relative_bias = np.vstack([self.relative_bias[:n], new])
+        """Forget the last sensors, or add some without a bias, if their number has changed."""
+        known = self._relative_bias.shape[1]
+        if n != known:
+            new = np.zeros((3, max(0, n - known)))
+            self._relative_bias = np.hstack([self._relative_bias[:, :n], new])
 
 
 @dataclass
@@ -101,84 +113,84 @@ class Mean:
     parameters: FusionParameters
 
     def fuse(self, epoch: Epoch) -> FusedRate:
-        """Fuse one epoch; the variance is that of one sensor."""
-        return _mean_of_members(epoch, epoch.rates_b, ~np.isnan(epoch.rates_b))
+        """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
+        rates, valid = _channels(epoch)
+        return _mean_of_active(epoch, rates, valid, valid)
 
 
 @dataclass
 class Median:
-    """The median of the valid readings, per axis; no bias tracking.
-
-    The variance of one sensor comes from the median absolute deviation, scaled for a Gaussian
-    (Rousseeuw and Croux, "Alternatives to the Median Absolute Deviation", 1993: 1.4826).
-    """
+    """The median of the valid readings, per axis."""
 
     parameters: FusionParameters
 
     def fuse(self, epoch: Epoch) -> FusedRate:
-        """Fuse one epoch."""
-        rates = epoch.rates_b
-        active = (~np.isnan(rates)).sum(axis=0)
-        rate = quantiles(rates, 0.5)[0]
-        deviation = quantiles(np.abs(rates - rate), 0.5)[0]
-        variance = np.where(active > 1, (1.4826 * deviation) ** 2, np.nan)
-        return FusedRate(epoch.time_us, rate, variance, active, _valid(rates))
+        """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
+        rates, valid = _channels(epoch)
+        (median,) = quantiles(rates, (0.5,))
+        (deviation,) = quantiles(np.abs(rates - median[:, None]), (0.5,))
+        count = valid.sum(axis=1)
+        variance = np.where(count > 1, (MAD_TO_STD * deviation) ** 2, np.nan)
+        return FusedRate(epoch.time_us, median, variance, count, _whole(valid))
 
 
 FUSIONS: dict[str, type[Risaf | Mean | Median]] = {"risaf": Risaf, "mean": Mean, "median": Median}
 
 
-def quantiles(values: Floats, *shares: float) -> list[Floats]:
-    """Quantiles of the valid values of each column, interpolated linearly.
+def quantiles(values: Floats, shares: tuple[float, ...]) -> Floats:
+    """Quantiles of the valid values of each row, interpolated linearly between order statistics.
 
-    The same numbers as `numpy.nanquantile(values, share, axis=0)`, to the last bit, without its
-    overhead of a millisecond.
+    To the last bit what `numpy.nanquantile(values, shares, axis=1)` gives, which takes seven times
+    as long.
 
     Parameters
     ----------
-    values : ndarray, shape (n, k)
-        NaN where not valid.
-    *shares : float
+    values : ndarray, shape (k, n)
+        Finite, or NaN where not valid.
+    shares : tuple of s floats
         In [0, 1].
 
     Returns
     -------
-    list of ndarray, shape (k,)
-        One for each share; NaN where a column has no valid value.
+    ndarray, shape (s, k)
+        NaN where a row has no valid value.
     """
-    if not len(values):
-        return [np.full(values.shape[1], np.nan) for _ in shares]
-    ordered = np.sort(values, axis=0)  # NaN comes last
-    last = np.maximum((~np.isnan(ordered)).sum(axis=0) - 1, 0)
-    columns = np.arange(values.shape[1])
-    results = []
-    for share in shares:
-        place = share * last
-        below = place.astype(np.intp)
-        part = place - below
-        low, high = ordered[below, columns], ordered[np.minimum(below + 1, last), columns]
-        step = high - low
-        results.append(np.where(part < 0.5, low + step * part, high - step * (1.0 - part)))
-    return results
+    if not values.size:
+        return np.full((len(shares), len(values)), np.nan)
+    ordered = np.sort(values, axis=1)  # NaN comes last
+    last = np.maximum((~np.isnan(ordered)).sum(axis=1) - 1, 0)
+    place = np.multiply.outer(shares, last)
+    below = place.astype(np.intp)
+    part = place - below
+    rows = np.arange(len(values))
+    low, high = ordered[rows, below], ordered[rows, np.minimum(below + 1, last)]
+    step = high - low
+    result: Floats = np.where(part < 0.5, low + step * part, high - step * (1.0 - part))
+    return result
 
 
-def _mean(rates: Floats) -> Floats:
-    valid = ~np.isnan(rates)
-    count = valid.sum(axis=0)
-    total = np.where(valid, rates, 0.0).sum(axis=0)
-    mean: Floats = np.divide(total, count, out=np.full(3, np.nan), where=count > 0)
-    return mean
+def _channels(epoch: Epoch) -> tuple[Floats, NDArray[np.bool_]]:
+    """The readings by channel, shape (3, n), NaN where not valid, and which are valid."""
+    rates = epoch.rates_b.T.copy()
+    valid = np.isfinite(rates)
+    return np.where(valid, rates, np.nan), valid
 
 
-def _mean_of_members(epoch: Epoch, rates: Floats, members: NDArray[np.bool_]) -> FusedRate:
-    """Mean and sample variance (one degree of freedom less) of the members, per axis."""
-    active = members.sum(axis=0)
-    total = np.where(members, rates, 0.0).sum(axis=0)
-    rate = np.divide(total, active, out=np.full(3, np.nan), where=active > 0)
-    square = (np.where(members, rates - rate, 0.0) ** 2).sum(axis=0)
-    variance = np.divide(square, active - 1, out=np.full(3, np.nan), where=active > 1)
-    return FusedRate(epoch.time_us, rate, variance, active, _valid(epoch.rates_b))
+def _mean_of_active(
+    epoch: Epoch, rates: Floats, active: NDArray[np.bool_], valid: NDArray[np.bool_]
+) -> FusedRate:
+    """Mean and sample variance of the active channels of each axis: eq. 7 and 8."""
+    count = active.sum(axis=1)
+    rate = rates.sum(axis=1, where=active) / _or_nan(count)
+    square = ((rates - rate[:, None]) ** 2).sum(axis=1, where=active)
+    return FusedRate(epoch.time_us, rate, square / _or_nan(count - 1), count, _whole(valid))
 
 
-def _valid(rates: Floats) -> int:
-    return int((~np.isnan(rates)).all(axis=1).sum())
+def _or_nan(count: NDArray[np.int64]) -> Floats:
+    """A divisor that gives NaN, silently, where there is nothing to divide by."""
+    return np.where(count > 0, count, np.nan)
+
+
+def _whole(valid: NDArray[np.bool_]) -> int:
+    """How many sensors are valid on all axes."""
+    return int(valid.all(axis=0).sum())

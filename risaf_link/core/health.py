@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from risaf_link.core.fusion import Epoch
 
-DEAD_AFTER_US = 1_000_000
+DEAD_AFTER = 1.0  # s
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,20 +22,21 @@ class ArrayHealth:
 class HealthMonitor:
     """Tells sensors that are silent for a moment from those that are silent for good.
 
-    A sensor with a valid reading on all axes is healthy; one without is suspect, and dead after a
-    second without.
+    A sensor with a valid reading on all axes is healthy; one without is suspect, and dead after
+    more than `DEAD_AFTER` without. When their number changes, all are judged anew.
     """
 
     def __init__(self) -> None:
-        self._last_valid_us = np.zeros(0, dtype=np.int64)
+        self._silent_for = np.zeros(0)  # s, each sensor
 
     def watch(self, epoch: Epoch) -> ArrayHealth:
-        """Take note of one epoch."""
-        valid = np.atleast_1d(~np.isnan(epoch.rates_b).any(axis=1))
-        if len(valid) != len(self._last_valid_us):
-            self._last_valid_us = np.full(len(valid), epoch.time_us)
-        self._last_valid_us[valid] = epoch.time_us
-        np.minimum(self._last_valid_us, epoch.time_us, out=self._last_valid_us)  # the clock reset
-        dead = epoch.time_us - self._last_valid_us > DEAD_AFTER_US
-        healthy, gone = int(valid.sum()), int(dead.sum())
-        return ArrayHealth(healthy, len(valid) - healthy - gone, gone)
+        """Take note of one epoch, and judge the sensors as of then."""
+        finite = np.isfinite(epoch.rates_b)
+        valid: NDArray[np.bool_] = np.logical_and.reduce(finite, axis=1)
+        if len(valid) != len(self._silent_for):
+            self._silent_for = np.zeros(len(valid))
+        else:
+            self._silent_for = np.where(valid, 0.0, self._silent_for + epoch.dt)
+        healthy = int(valid.sum())
+        dead = int((self._silent_for > DEAD_AFTER).sum())
+        return ArrayHealth(healthy, len(valid) - healthy - dead, dead)

@@ -1,6 +1,7 @@
 """Quaternions (w, x, y, z) and the angles made from them.
 
-Sola, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508.
+Hamilton's convention throughout: Sola, "Quaternion kinematics for the error-state Kalman filter",
+arXiv:1711.02508; equation numbers here are his. Angles are in rad.
 """
 
 import math
@@ -12,26 +13,37 @@ Floats = NDArray[np.float64]
 
 
 def wrap(angle: float) -> float:
-    """Bring an angle into (-pi, pi]."""
-    return math.pi - (math.pi - angle) % math.tau
+    """Bring an angle, rad, into (-pi, pi]; one that is there already comes back as it was.
+
+    Raises
+    ------
+    ValueError
+        If it is infinite; NaN stays NaN.
+    """
+    remainder = math.remainder(angle, math.tau)
+    return math.pi if remainder == -math.pi else remainder
 
 
 def yaw_of(q_nb: Floats) -> float:
-    """Yaw of an attitude quaternion of any length but zero, rad, in (-pi, pi]."""
-    w, x, y, z = q_nb
+    """Yaw, rad, in [-pi, pi], of an attitude quaternion, shape (4,), of any length but zero."""
+    w, x, y, z = q_nb.tolist()
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 def euler_from_quaternion(q_nb: Floats) -> tuple[float, float, float]:
-    """Roll, pitch and yaw (z-y-x) of a unit quaternion, rad."""
-    w, x, y, z = q_nb
+    """Roll, pitch and yaw (z-y-x), rad, of a unit quaternion, shape (4,).
+
+    They are those of the matrix of eq. 115. At a pitch of a quarter turn only the sum or the
+    difference of roll and yaw is defined; both are then finite, and without meaning.
+    """
+    w, x, y, z = q_nb.tolist()
     roll = math.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
     pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - x * z))))
     return roll, pitch, yaw_of(q_nb)
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Floats:
-    """Unit quaternion of roll, pitch and yaw (z-y-x), rad."""
+    """Unit quaternion, shape (4,), of roll, pitch and yaw (z-y-x), rad: yaw (x) pitch (x) roll."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
@@ -45,9 +57,9 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Floats:
     )
 
 
-def matrix_from_quaternion(q_nb: Floats) -> Floats:
-    """Rotation matrix `R_nb`, shape (..., 3, 3), of unit quaternions, shape (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(q_nb, dtype=float), -1, 0)
+def matrix_from_quaternion(q_ab: Floats) -> Floats:
+    """Rotation matrices `R_ab`, shape (..., 3, 3), of unit quaternions, shape (..., 4): eq. 115."""
+    w, x, y, z = np.moveaxis(np.asarray(q_ab, dtype=float), -1, 0)
     rows = [
         [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
@@ -57,21 +69,21 @@ def matrix_from_quaternion(q_nb: Floats) -> Floats:
 
 
 def left_matrix(q: Floats) -> Floats:
-    """Matrix L with `L @ p` = q (x) p, the Hamilton product; shape (4, 4)."""
-    w, x, y, z = q
+    """Matrix L, shape (4, 4), with `L @ p` = q (x) p, the Hamilton product: eq. 18."""
+    w, x, y, z = q.tolist()
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 def right_matrix(q: Floats) -> Floats:
-    """Matrix R with `R @ p` = p (x) q, the Hamilton product; shape (4, 4)."""
-    w, x, y, z = q
+    """Matrix R, shape (4, 4), with `R @ p` = p (x) q, the Hamilton product: eq. 18."""
+    w, x, y, z = q.tolist()
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
 
 
 def rate_matrix(rate_b: Floats) -> Floats:
-    """Matrix Omega with `Omega @ q` = q (x) (0, rate); shape (4, 4).
+    """Matrix Omega, shape (4, 4), with `Omega @ q` = q (x) (0, rate), of a rate, shape (3,), rad/s.
 
-    Sola, eq. 199: the right-product matrix of a pure quaternion.
+    The right matrix of a pure quaternion: skew symmetric.
     """
-    x, y, z = rate_b
+    x, y, z = rate_b.tolist()
     return np.array([[0.0, -x, -y, -z], [x, 0.0, z, -y], [y, -z, 0.0, x], [z, y, -x, 0.0]])

@@ -9,17 +9,21 @@ from risaf_link.core.rotation import wrap
 
 @dataclass(frozen=True, slots=True)
 class HeadingScore:
-    """Heading errors over a stretch of time. Angles in rad."""
+    """Heading errors over a stretch of time."""
 
     samples: int
-    rmse: float
-    final: float  # size of the last error
-    largest: float
+    rmse: float  # rad, root of the mean square
+    final: float  # rad, size of the last error
+    largest: float  # rad
     drift: float  # rad/s: by how much the error grew or shrank from first to last, over the time
 
 
 class ErrorAccount:
-    """Adds up heading errors, in constant memory."""
+    """Adds up heading errors, in constant memory.
+
+    Sizes are those of wrapped errors; the drift follows an error through half a turn, as long as it
+    changes by less than that between two samples.
+    """
 
     def __init__(self) -> None:
         self._samples = 0
@@ -28,9 +32,9 @@ class ErrorAccount:
         self._first = self._last = (0.0, 0.0)  # time, s; error, rad, unwrapped
 
     def add(self, time_s: float, error: float) -> None:
-        """Take one error, rad, in (-pi, pi]."""
+        """Take one error, rad, at a time, s, that is not before the last one."""
         if self._samples:
-            error = self._last[1] + wrap(error - self._last[1])  # a drift may pass half a turn
+            error = self._last[1] + wrap(error - self._last[1])
         else:
             self._first = (time_s, error)
         self._last = (time_s, error)
@@ -77,13 +81,20 @@ class YawTrack:
         return self._points[-1][0] if self._points else None
 
     def at(self, time_us: int) -> float | None:
-        """Yaw at a time, interpolated; None where the track does not reach."""
+        """Yaw at a time, interpolated, rad; None where the track does not reach.
+
+        Between two points it may lie up to half a turn outside of (-pi, pi].
+        """
         later = None
         for point in reversed(self._points):
-            if point[0] <= time_us:
-                if later is None or later[0] == point[0]:
-                    return point[1] if point[0] == time_us else None
-                part = (time_us - point[0]) / (later[0] - point[0])
-                return point[1] + part * wrap(later[1] - point[1])
+            if point[0] == time_us:
+                return point[1]
+            if point[0] < time_us:
+                return _between(point, later, time_us) if later else None
             later = point
         return None
+
+
+def _between(earlier: tuple[int, float], later: tuple[int, float], time_us: int) -> float:
+    part = (time_us - earlier[0]) / (later[0] - earlier[0])
+    return earlier[1] + part * wrap(later[1] - earlier[1])
