@@ -1,7 +1,9 @@
 """The vehicle's boot clock, for an array that counts its own time.
 
 Two clocks are compared through a third, the arrival time: of all that came within some seconds, the
-frame that was least delayed tells best how far a sender's clock is ahead of it.
+frame that was least delayed tells best how far a sender's clock is ahead of it. When a clock seems
+to jump it may be the third that was set, or a link may have stalled: the offset that was found
+before holds until both clocks have been compared with the third again.
 """
 
 from risaf_link.mavlink.dialect import IDS, reader
@@ -23,10 +25,12 @@ class _Lead:
         self._current_us = 0
         self._since_us = 0
 
-    def note(self, time_us: int, received_us: int) -> None:
+    def note(self, time_us: int, received_us: int) -> bool:
+        """Take a time and its arrival; whether one of the clocks has jumped."""
         lead_us = time_us - received_us
-        if self.lead_us is None or abs(lead_us - self.lead_us) > SAME_CLOCK_US:
-            self.lead_us = self._current_us = lead_us  # the first one, or a clock has jumped
+        has_jumped = self.lead_us is not None and abs(lead_us - self.lead_us) > SAME_CLOCK_US
+        if self.lead_us is None or has_jumped:
+            self.lead_us = self._current_us = lead_us
             self._since_us = received_us
         elif 0 <= received_us - self._since_us < WINDOW_US:
             self._current_us = max(self._current_us, lead_us)
@@ -34,6 +38,7 @@ class _Lead:
         else:
             self.lead_us = max(self._current_us, lead_us)
             self._current_us, self._since_us = lead_us, received_us
+        return has_jumped
 
 
 class VehicleClock:
@@ -46,6 +51,7 @@ class VehicleClock:
     def __init__(self) -> None:
         self._autopilot: tuple[int, int] | None = None
         self._vehicle, self._array = _Lead(), _Lead()
+        self._offset_us = 0
 
     def hear(self, frame: Frame, received_us: int) -> None:
         """Take note of a frame that may tell of an autopilot or of its time."""
@@ -56,12 +62,15 @@ class VehicleClock:
                 self._autopilot = sender
         elif frame.message_id == IDS["SYSTEM_TIME"] and sender == self._autopilot:
             _, boot_ms = _SYSTEM_TIME(frame.payload)
-            self._vehicle.note(boot_ms * 1000, received_us)
+            if self._vehicle.note(boot_ms * 1000, received_us):
+                self._array = _Lead()
 
     def boot_us(self, time_us: int, received_us: int) -> int:
         """Time of an epoch, which has just been received, on the vehicle's clock."""
-        self._array.note(time_us, received_us)
-        if self._vehicle.lead_us is None or self._array.lead_us is None:
+        if self._array.note(time_us, received_us):
+            self._vehicle = _Lead()
+        if self._vehicle.lead_us is not None and self._array.lead_us is not None:
+            self._offset_us = self._vehicle.lead_us - self._array.lead_us
+        if abs(self._offset_us) < SAME_CLOCK_US:
             return time_us
-        offset_us = self._vehicle.lead_us - self._array.lead_us
-        return time_us if abs(offset_us) < SAME_CLOCK_US else time_us + offset_us
+        return max(time_us + self._offset_us, 0)

@@ -3,17 +3,20 @@
 How a stream is cut into frames. A frame starts with a mark (0xFE: MAVLink 1, 0xFD: MAVLink 2),
 says its length in the next byte, and ends in a checksum that is seeded with a byte of the
 message's definition (CRC_EXTRA). Nothing else sets frames apart, so a mark may be any byte of a
-payload, and a corrupt length points anywhere. Two rules keep one corrupt byte from costing more
-than its own frame:
+payload, and a corrupt length points anywhere. Three rules keep one bad byte from costing more than
+its own frame:
 
 1. A frame whose checksum fails is given up one byte at a time: the search for the next frame goes
    on behind its mark, not behind its end.
-2. A message without a known definition has no checksum that could be verified. It is believed only
-   where a frame must start, that is directly behind another frame; if no verified frame starts
-   inside of it; and if something that looks like a frame (or the end of the stream) follows it.
+2. Where no frame follows a good one, the start of the next may have been taken for its end: for its
+   last byte or for a part of its signature, which no checksum covers. The search goes on there.
+3. The CRC_EXTRA of a message without a known definition is not known either; but its checksum must
+   fit some CRC_EXTRA, as one in 256 does by chance. Such a frame is believed if moreover a mark
+   follows it, or the end of the stream, and if no frame of a known message lies inside of it.
 
 Whether a frame is returned depends on the bytes of the stream alone and never on how they were cut
-into chunks. What cannot be decided yet stays in the buffer: at most two frames.
+into chunks. What cannot be decided yet stays in the buffer: little more than a frame. A frame of a
+known message does not wait for what follows it.
 
 Where every frame of a stream comes with a prefix (the time stamp in a tlog), the parser is told its
 size, knows by it where a frame must start, and hands it out with the frame.
@@ -23,25 +26,26 @@ Signature: https://mavlink.io/en/guide/message_signing.html
 """
 
 import re
+import struct
 from collections import Counter
-from dataclasses import dataclass
 from enum import Enum, auto
-from typing import NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
+from msgspec import Struct
 
 from risaf_link.mavlink.dialect import CRC_EXTRA
 
-MARK_V1, MARK_V2 = 0xFE, 0xFD
-HEADER_V1, HEADER_V2 = 6, 10
+MARKS = MARK_V1, MARK_V2 = 0xFE, 0xFD
 CHECKSUM, SIGNATURE = 2, 13
 SIGNED = 0x01  # the only incompatibility flag that is defined
 
-_MARK = re.compile(b"[\xfd\xfe]")
+_MARK = re.compile(b"[%c%c]" % MARKS)
+_HEADER_V1 = struct.Struct("<xBBBBB")
+_HEADER_V2 = struct.Struct("<xBBxBBBHB")
+_CRC_STEPS = frozenset(mcrf4xx(bytes((byte,)), 0) for byte in range(256))
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(Struct, frozen=True):  # a frozen dataclass takes as long to make as all the rest
     """One frame; its checksum holds, unless its message is unknown."""
 
     raw: bytes  # all of it, from the mark to the end of the signature
@@ -66,13 +70,15 @@ class _No(Enum):
     END = auto()  # its end has not arrived yet
 
 
-class _Header(NamedTuple):
+class _Header(Struct, frozen=True):
     version: int
+    sequence: int
+    system: int
+    component: int
     message_id: int
     payload: int  # where the payload starts
     checksum: int  # where it ends
     end: int  # where the frame ends
-    plain: bool  # no compatibility flags
 
 
 class FrameParser:
@@ -98,8 +104,9 @@ class FrameParser:
         self.skipped = 0
         self._prefix_size = prefix_size
         self._buffer = b""
-        self._searched = 0  # no frame starts before this place of the buffer
-        self._in_step = True  # a frame must start right at the buffer's start, behind its prefix
+        self._done = 0  # where the last frame ended
+        self._searched = 0  # where the search goes on, if not in step
+        self._in_step = True  # a frame must start behind the last one and a prefix
         self._ended = False
 
     def receive_data(self, data: bytes) -> list[Frame]:
@@ -117,20 +124,21 @@ class FrameParser:
         """Take note that the stream has ended; decide what was still open."""
         self._ended = True
         frames = self._cut()
-        self.skipped += len(self._buffer)
-        self._buffer = b""
+        self.skipped += len(self._buffer) - self._done
+        self._buffer, self._done = b"", 0
         return frames
 
     def _cut(self) -> list[Frame]:
         frames = []
-        done, at = 0, self._searched  # the last frame's end; where to look next
+        done, at, free = self._done, self._searched, 0  # the next frame may start from `free` on
         while True:
             start = done + self._prefix_size if self._in_step else self._next_mark(at)
             found = self._frame_at(start, done) if start < len(self._buffer) else _No.END
             if isinstance(found, Frame):
                 frames.append(found)
-                self.skipped += start - len(found.prefix) - done
-                done = at = start + len(found.raw)
+                self.skipped += max(start - len(found.prefix) - done, 0)
+                done = start + len(found.raw)
+                at = free = done - (len(found.signature) or 1)
                 self._in_step = True
             elif found is _No.END and (not self._ended or start >= len(self._buffer)):
                 break
@@ -139,9 +147,10 @@ class FrameParser:
                 self._in_step = False
             else:
                 at = start + 1
-        keep = done if self._in_step else max(done, start - self._prefix_size)
-        self.skipped += keep - done
+        keep = free if self._in_step else max(free, start - self._prefix_size)
+        self.skipped += max(keep - done, 0)
         self._buffer = self._buffer[keep:]
+        self._done = max(done - keep, 0)
         self._searched = 0 if self._in_step else start - keep
         return frames
 
@@ -157,90 +166,84 @@ class FrameParser:
         header = self._header_at(start)
         if isinstance(header, _No):
             return header
-        found = self._verified(start, header)
-        if found is _No.UNVERIFIED and self._in_step:
-            found = self._believed(start, header)
-        if isinstance(found, _No):
-            return found
-        return self._frame(
-            start, header, self._buffer[max(done, start - self._prefix_size) : start]
+        known = header.message_id in CRC_EXTRA
+        fault = self._fault(start, header) or (None if known else self._doubt(start, header))
+        if fault:
+            return fault
+        buffer = self._buffer
+        return Frame(
+            buffer[start : header.end],
+            header.version,
+            header.sequence,
+            header.system,
+            header.component,
+            header.message_id,
+            buffer[header.payload : header.checksum],
+            buffer[header.checksum + CHECKSUM : header.end],
+            known,
+            buffer[max(done, start - self._prefix_size) : start],
         )
 
     def _header_at(self, start: int) -> _Header | _No:
         buffer = self._buffer
         mark = buffer[start]
         if mark == MARK_V2:
-            if len(buffer) < start + HEADER_V2:
+            payload = start + _HEADER_V2.size
+            if len(buffer) < payload:
                 return _No.END
-            flags = buffer[start + 2]
+            size, flags, sequence, system, component, low, high = _HEADER_V2.unpack_from(
+                buffer, start
+            )
             if flags & ~SIGNED:
                 return _No.INCOMPATIBLE
-            message_id = int.from_bytes(buffer[start + 7 : start + HEADER_V2], "little")
-            payload = start + HEADER_V2
-            checksum = payload + buffer[start + 1]
+            checksum = payload + size
             end = checksum + CHECKSUM + (SIGNATURE if flags else 0)
-            return _Header(2, message_id, payload, checksum, end, buffer[start + 3] == 0)
+            message_id = low | high << 16
+            return _Header(2, sequence, system, component, message_id, payload, checksum, end)
         if mark == MARK_V1:
-            if len(buffer) < start + HEADER_V1:
+            payload = start + _HEADER_V1.size
+            if len(buffer) < payload:
                 return _No.END
-            payload = start + HEADER_V1
-            checksum = payload + buffer[start + 1]
-            return _Header(1, buffer[start + 5], payload, checksum, checksum + CHECKSUM, plain=True)
+            size, sequence, system, component, message_id = _HEADER_V1.unpack_from(buffer, start)
+            checksum = payload + size
+            end = checksum + CHECKSUM
+            return _Header(1, sequence, system, component, message_id, payload, checksum, end)
         return _No.MARK
 
-    def _verified(self, start: int, header: _Header) -> _Header | _No:
-        """Whether the frame is whole and its checksum holds."""
-        extra = CRC_EXTRA.get(header.message_id)
-        if extra is None:
-            return _No.UNVERIFIED
+    def _fault(self, start: int, header: _Header) -> _No | None:
+        """What is wrong with a frame: it is not whole, or its checksum does not hold."""
         if len(self._buffer) < header.end:
             return _No.END
-        checksum = checksum_of(self._buffer[start + 1 : header.checksum], extra)
+        content = self._buffer[start + 1 : header.checksum]
         sent = self._buffer[header.checksum : header.checksum + CHECKSUM]
-        return header if sent == checksum else _No.CHECKSUM
+        extra = CRC_EXTRA.get(header.message_id)
+        holds = fits_any(content, sent) if extra is None else sent == checksum_of(content, extra)
+        return None if holds else _No.CHECKSUM
 
-    def _believed(self, start: int, header: _Header) -> _Header | _No:
-        """Whether an unknown message is believed: the second rule at the head of this module."""
-        if len(self._buffer) < header.end:
-            return _No.END
-        for mark in _MARK.finditer(self._buffer, start + 1, header.end):
-            inner = self._header_at(mark.start())
-            found = inner if isinstance(inner, _No) else self._verified(mark.start(), inner)
-            if isinstance(found, _Header):
+    def _doubt(self, start: int, header: _Header) -> _No | None:
+        """Why an unknown message is not believed: the third rule at the head of this module."""
+        behind = header.end + self._prefix_size
+        if behind < len(self._buffer):
+            if self._buffer[behind] not in MARKS:
                 return _No.UNVERIFIED
-            if found is _No.END and not self._ended:
-                return found
-        return self._looks_like_a_frame(header)
+        elif not self._ended:
+            return _No.END
+        for mark in _MARK.finditer(self._buffer, start + 1, header.checksum):
+            inner = self._header_at(mark.start())
+            if (
+                isinstance(inner, _Header)
+                and inner.message_id in CRC_EXTRA
+                and inner.end <= header.end
+                and not self._fault(mark.start(), inner)
+            ):
+                return _No.UNVERIFIED
+        return None
 
-    def _looks_like_a_frame(self, header: _Header) -> _Header | _No:
-        """Answer `header` if what follows its frame could be the next one."""
-        start = header.end + self._prefix_size
-        if start >= len(self._buffer):
-            return header if self._ended and header.end == len(self._buffer) else _No.END
-        following = self._header_at(start)
-        if isinstance(following, _No):
-            return _No.END if following is _No.END and not self._ended else _No.UNVERIFIED
-        if following.version == 2:
-            believable = following.plain or following.message_id in CRC_EXTRA
-            return header if believable else _No.UNVERIFIED
-        found = self._verified(start, following)
-        return header if isinstance(found, _Header) else found
 
-    def _frame(self, start: int, header: _Header, prefix: bytes) -> Frame:
-        raw = self._buffer[start : header.end]
-        sequence, system, component = raw[4:7] if header.version == 2 else raw[2:5]
-        return Frame(
-            raw,
-            header.version,
-            sequence,
-            system,
-            component,
-            header.message_id,
-            self._buffer[header.payload : header.checksum],
-            raw[-SIGNATURE:] if header.version == 2 and raw[2] & SIGNED else b"",
-            header.message_id in CRC_EXTRA,
-            prefix,
-        )
+def fits_any(content: bytes, checksum: bytes) -> bool:
+    """Whether a checksum, as it is sent, is right for some CRC_EXTRA."""
+    step = int.from_bytes(checksum, "little") ^ mcrf4xx(content) >> 8
+    return step in _CRC_STEPS
 
 
 def checksum_of(content: bytes, extra: int) -> bytes:

@@ -5,13 +5,12 @@ header. MAVProxy keeps the number of a link in the two low bits of the time: 0 r
 A `.tlog.raw` holds frames alone.
 
 Real logs hold garbage between records, and stamps that are wrong. The frame parser finds the
-frames; a stamp is believed if it is close behind the one before it or if most of those that follow
-agree with it, and else replaced by the one before.
+frames. A stamp is believed if those that follow bear it out, and else replaced by the one before.
 """
 
 import struct
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from risaf_link.mavlink.frame import Frame, FrameParser
@@ -19,7 +18,7 @@ from risaf_link.mavlink.frame import Frame, FrameParser
 STAMP = struct.Struct(">Q")
 RECEIVED, SENT = 0, 3
 
-STEP_US = 10_000_000  # stamps this close agree
+LEAP_US = 600_000_000  # a log is hardly ever silent for so long
 LOOKAHEAD = 8  # records
 SAMPLE = 16384  # bytes that tell a log with stamps from one without
 
@@ -64,42 +63,60 @@ class TlogReader:
 
     def __init__(self, chunks: Iterable[bytes]) -> None:
         self._chunks = iter(chunks)
-        self._first = next(self._chunks, b"")
-        self.parser = FrameParser(_prefix_size(self._first))
+        self._start = b""
+        for chunk in self._chunks:
+            self._start += chunk
+            if len(self._start) >= SAMPLE:
+                break
+        self.parser = FrameParser(_prefix_size(self._start[:SAMPLE]))
         self.stamps_replaced = 0
 
     def __iter__(self) -> Iterator[Record]:
         last: int | None = None
-        ahead: deque[tuple[Frame, int | None]] = deque()
+        ahead: deque[Frame] = deque()
+        stamps: deque[int | None] = deque()
         for frame in self._frames():
-            ahead.append((frame, _stamp(frame)))
+            ahead.append(frame)
+            stamps.append(_stamp(frame))
             if len(ahead) > LOOKAHEAD:
-                last = self._believe(ahead, last)
-                yield Record(last, ahead.popleft()[0])
+                last = self._time(stamps, last)
+                yield Record(last, ahead.popleft())
         while ahead:
-            last = self._believe(ahead, last)
-            yield Record(last, ahead.popleft()[0])
+            last = self._time(stamps, last)
+            yield Record(last, ahead.popleft())
 
     def _frames(self) -> Iterator[Frame]:
-        yield from self.parser.receive_data(self._first)
+        yield from self.parser.receive_data(self._start)
         for chunk in self._chunks:
             yield from self.parser.receive_data(chunk)
         yield from self.parser.end()
 
-    def _believe(self, ahead: deque[tuple[Frame, int | None]], last: int | None) -> int:
-        """Time of the first record, given those behind it and the time before."""
-        stamp = ahead[0][1]
-        others = [s for _, s in list(ahead)[1:] if s is not None]
-        if stamp is not None:
-            if last is not None and 0 <= stamp - last <= STEP_US:
-                return stamp
-            agreeing = sum(abs(other - stamp) <= STEP_US for other in others)
-            if 2 * agreeing > len(others) or (last is None and not others):
-                return stamp
+    def _time(self, stamps: deque[int | None], last: int | None) -> int:
+        """Take the first stamp; the time of its record, given the one before."""
+        stamp = stamps.popleft()
+        following = [s for s in stamps if s is not None]
+        if stamp is not None and _is_believable(stamp, last, following):
+            return stamp
         self.stamps_replaced += 1
         if last is not None:
             return last
-        return sorted(others)[len(others) // 2] if others else 0
+        tails = (following[i:] for i in range(len(following)))
+        return next((tail[0] for tail in tails if _is_believable(tail[0], None, tail[1:])), 0)
+
+
+def _is_believable(stamp: int, last: int | None, following: Sequence[int]) -> bool:
+    """Whether the stamps that follow bear out this one, given the time before."""
+    half = len(following) / 2
+    if last is None:
+        return not following or sum(0 <= s - stamp <= LEAP_US for s in following) > half
+    if stamp < last:  # the clock may have been set
+        return sum(stamp <= s < last for s in following) > half
+    if stamp > last + LEAP_US:
+        return sum(stamp <= s for s in following) > half
+    behind = following[0] if following else stamp
+    if last <= behind <= last + LEAP_US:
+        return stamp <= behind
+    return sum(last <= s < stamp for s in following) <= half
 
 
 def _stamp(frame: Frame) -> int | None:
@@ -109,10 +126,8 @@ def _stamp(frame: Frame) -> int | None:
 
 
 def _prefix_size(start: bytes) -> int:
-    """Size of the stamps of a log: 0 if it reads better as a log without."""
-
-    def good_frames(size: int) -> int:
-        frames = FrameParser(size).receive_data(start[:SAMPLE])
-        return sum(len(frame.prefix) == size for frame in frames)
-
-    return max((STAMP.size, 0), key=good_frames)
+    """Size of the stamps of a log: 0 if most frames adjoin each other."""
+    stamped = FrameParser(STAMP.size).receive_data(start)
+    bare = FrameParser().receive_data(start)
+    adjoining = sum(not frame.prefix for frame in stamped) + len(bare) - len(stamped)
+    return 0 if 2 * adjoining > len(bare) else STAMP.size
