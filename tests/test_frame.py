@@ -382,6 +382,23 @@ def test_an_unknown_message_is_found_behind_garbage():
     ]
 
 
+def test_an_unknown_message_in_an_unknown_message_is_payload():
+    frame = framed(UNKNOWN, framed(UNKNOWN + 1, b"1234", 5), 5)
+    assert raws(frame + heartbeat()) == [frame, heartbeat()]
+
+
+def test_a_frame_that_only_starts_in_an_unknown_message_does_not_speak_against_it():
+    start = bytes((0xFE, 20, 1, 7, 9, HEARTBEAT))
+    unknown_frame = framed(UNKNOWN, start, 5)
+    head = b"\xfd\x0c\0\0\1\7\x09" + HEARTBEAT.to_bytes(3, "little")
+    crossing = start + unknown_frame[-2:] + head + b"12345678"
+    checksum = frame_module.checksum_of(crossing[1:], CRC_EXTRA[HEARTBEAT])
+    follower = heartbeat(b"12345678" + checksum + b"90")
+    assert raws(crossing + checksum) == [crossing + checksum]
+    for pieces in ([unknown_frame + follower], chunks(unknown_frame + follower, [1] * 60)):
+        assert raws(*pieces) == [unknown_frame, follower]
+
+
 def test_one_unknown_message_in_256_gets_past_with_a_wrong_checksum():
     random = seeded(41)
     frames = [bytearray(unknown(random)) for _ in range(5000)]

@@ -105,7 +105,6 @@ class FrameParser:
         self._prefix_size = prefix_size
         self._buffer = b""
         self._done = 0  # where the last frame ended
-        self._searched = 0  # where the search goes on, if not in step
         self._in_step = True  # a frame must start behind the last one and a prefix
         self._ended = False
 
@@ -130,7 +129,7 @@ class FrameParser:
 
     def _cut(self) -> list[Frame]:
         frames = []
-        done, at, free = self._done, self._searched, 0  # the next frame may start from `free` on
+        done, at, free = self._done, 0, 0  # the next frame may start from `free` on
         while True:
             start = done + self._prefix_size if self._in_step else self._next_mark(at)
             found = self._frame_at(start, done) if start < len(self._buffer) else _No.END
@@ -151,7 +150,6 @@ class FrameParser:
         self.skipped += max(keep - done, 0)
         self._buffer = self._buffer[keep:]
         self._done = max(done - keep, 0)
-        self._searched = 0 if self._in_step else start - keep
         return frames
 
     def _count(self, found: _No) -> None:
