@@ -198,28 +198,29 @@ def replay(log: Path, config_path: Path | None, settings: tuple[str, ...], **opt
 @click.option("--duration", type=float, metavar="S", help="Seconds.")
 @click.option("--sensors", type=int, metavar="N", help="Gyros in the array.")
 @click.option("--rate", type=float, metavar="HZ", help="Epochs a second.")
+@click.option(
+    "--faults",
+    metavar="NAME,NAME",
+    help="Sensor faults that are on; `none`, or `default` for the scenario's own.",
+)
 def simulate(
-    scenario: str,
-    seed: int,
-    out: Path | None,
-    url: str | None,
-    duration: float | None,
-    sensors: int | None,
-    rate: float | None,
+    scenario: str, out: Path | None, url: str | None, faults: str | None, **size: Any
 ) -> None:
     """Simulate a vehicle with an array, as a tlog or live on a link.
 
-    SCENARIO is `circle`: the paper's circle with noise, random walks of the biases, and spikes. The
-    truth is in HIL_STATE_QUATERNION.
+    SCENARIO is one of `circle` (the paper's: noise, random walks of the biases, spikes), `drive1`
+    (constant speed, GPS cut after 100 s), `drive2` (an unpaved road, a third of the array shocked,
+    a long outage of GPS) and `ekf2` (one sound IMU). The truth is in HIL_STATE_QUATERNION.
 
     \b
     risaf-link simulate circle --seed 1 --out circle.tlog
+    risaf-link simulate drive2 --seed 1 --faults none --out smooth.tlog
     risaf-link simulate circle --seed 1 --sensors 150 --live udpout://127.0.0.1:14560
     """
     from risaf_link.sim.scenario import scenario as choose
     from risaf_link.sim.stream import frames, record_time_us
 
-    chosen = choose(scenario, seed, duration, sensors, rate)
+    chosen = choose(scenario, faults=faults.split(",") if faults else None, **size)
     if out is None and url is None:
         raise click.UsageError("expected --out LOG.tlog or --live URL")
     if out:

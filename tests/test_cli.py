@@ -90,6 +90,14 @@ def test_simulate_then_replay(tmp_path):
     assert {row["reference"] for row in summary["outages"]} == {"truth", "gps"}
 
 
+def test_faults_of_the_sensors_can_be_switched(tmp_path):
+    logs = {faults: tmp_path / f"{faults}.tlog" for faults in ("none", "default", "frozen")}
+    for faults, log in logs.items():
+        options = ("--duration", 2, "--faults", faults, "--out", log)
+        assert call("simulate", "circle", "--seed", 1, *options).exit_code == 0
+    assert len({log.read_bytes() for log in logs.values()}) == 3
+
+
 def test_inspect_says_what_is_there_and_what_can_be_done_with_it():
     text = call("inspect", DRIVE).stdout
     assert re.search(r"1 +1 +RAW_IMU +1537 +50\.0", text)
@@ -158,7 +166,10 @@ def test_a_log_without_samples_says_what_would_do(tmp_path):
         (["replay", DRIVE, "--set", "fusion.gaet=1"], ["fusion.gaet: unknown key; known: method"]),
         (["replay", DRIVE, "--config", "none.yaml"], ["none.yaml: No such file"]),
         (["replay", DRIVE, "--out", "/nowhere/out.tlog"], ["/nowhere/out.tlog: No such file"]),
-        (["simulate", "cricle", "--seed", 1, "--out", "x"], ["'cricle', expected one of circle"]),
+        (
+            ["simulate", "cricle", "--seed", 1, "--out", "x"],
+            ["'cricle', expected one of circle, drive1"],
+        ),
         (["simulate", "circle", "--seed", 1, "--live", "udp://x:1"], ["'udp://x:1' found"]),
         (["run", "--set", "links=[{name: a, url: x}]"], ["links.0.url: a: 'x' found, one of"]),
         (["check-config", "none.yaml"], ["none.yaml: No such file"]),

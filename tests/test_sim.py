@@ -14,13 +14,16 @@ from pymavlink.dialects.v20 import common
 from risaf_link.errors import ConfigError
 from risaf_link.mavlink import risaf
 from risaf_link.mavlink.tlog import TlogReader, record
+from risaf_link.sim import autopilot
 from risaf_link.sim.array import CHUNK, count_scale
 from risaf_link.sim.readings import readings
 from risaf_link.sim.scenario import BOOT_US, scenario
 from risaf_link.sim.sensors import TriadErrors
 from risaf_link.sim.stream import EPOCH_START_US, frames, record_time_us
 
-ACCELEROMETERS = TriadErrors(1e-3, 0.05, 1e-4, 0.001, 20.0, 4 * 9.80665)
+GPS = common.MAVLink_gps_raw_int_message
+FIX_TYPE = GPS.ordered_fieldnames.index("fix_type")
+ACCELEROMETERS = TriadErrors(1e-3, 0.05, 1e-4, 4 * 9.80665)
 
 
 def decoded(chosen):
@@ -110,13 +113,13 @@ def test_a_rate_beyond_the_range_saturates_and_never_becomes_invalid():
 def test_a_reading_that_is_not_valid_is_marked():
     chosen = scenario("circle", 7, duration=0.02, sensors=2)
 
-    def blind(time_s):
-        truth = chosen.trajectory(time_s)
-        return replace(truth, rate_b=truth.rate_b * [1.0, 1.0, np.nan])
+    class Blind:
+        def strike(self, _target):
+            return lambda _time_s, _truth_b, readings: np.copyto(readings[:, 1, 2], np.nan)
 
-    message = decoded(replace(chosen, trajectory=blind))["GYRO_ARRAY"][0][1]
-    assert message.rates[2] == message.rates[5] == -32768
-    assert -32768 not in message.rates[:2]
+    message = decoded(replace(chosen, faults={"invalid": Blind()}))["GYRO_ARRAY"][0][1]
+    assert message.rates[5] == -32768
+    assert -32768 not in message.rates[:5]
 
 
 def test_gps_describes_where_the_vehicle_was_before_its_latency():
@@ -222,8 +225,8 @@ def test_gps_does_not_depend_on_the_array():
 def test_gyros_and_accelerometers_do_not_err_together():
     chosen = scenario("circle", 3, duration=1.0)
     block = next(readings(replace(chosen, accelerometers=chosen.gyros)))
-    rates = block.rates_b - block.truth.rate_b[:, None]
-    forces = block.forces_b - block.truth.force_b[:, None]
+    rates = block.rates_b - block.ideal_rates_b[:, None]
+    forces = block.forces_b - block.ideal_forces_b[:, None]
     assert abs(np.corrcoef(rates[..., :2].ravel(), forces[..., :2].ravel())[0, 1]) < 0.05
 
 
@@ -264,3 +267,56 @@ def test_what_cannot_be_simulated_is_refused_in_one_line(bad, text):
     with pytest.raises(ConfigError) as error:
         scenario("circle", **{"seed": 1, **bad})
     assert str(error.value) == text
+
+
+def test_a_receiver_without_a_fix_says_so_and_recovers():
+    chosen = replace(
+        scenario("circle", 7, duration=30.0, sensors=1, rate=1), outages=((5.0, 8.0), (20.0, 22.0))
+    )
+    seen = decoded(chosen)
+    messages = seen["GPS_RAW_INT"]
+    assert len(messages) == 150
+    last = None
+    for time_us, gps in messages:
+        arrival_s = (time_us - BOOT_US) / 1e6
+        if 5.0 <= arrival_s < 8.0 or 20.0 <= arrival_s < 22.0:
+            assert (gps.fix_type, gps.satellites_visible) == (1, 0)
+            assert {gps.vel, gps.cog, gps.eph, gps.epv} == {65535}
+            assert (gps.lat, gps.lon, gps.alt) == last
+        else:
+            assert (gps.fix_type, gps.h_acc) == (3, 1500)
+            assert gps.vel < 1100
+            last = gps.lat, gps.lon, gps.alt
+    sound = decoded(replace(chosen, outages=()))
+    told = [str(m) for _, m in messages if m.fix_type == 3]
+    assert set(told) < {str(m) for _, m in sound["GPS_RAW_INT"]}
+    truth = [str(m) for _, m in seen["HIL_STATE_QUATERNION"]]
+    assert truth == [str(m) for _, m in sound["HIL_STATE_QUATERNION"]]
+
+
+def test_a_receiver_that_never_had_a_fix_tells_none():
+    chosen = replace(
+        scenario("circle", 7, duration=3.0, sensors=1, rate=1), outages=((0.0, math.inf),)
+    )
+    messages = decoded(chosen)["GPS_RAW_INT"]
+    assert {(gps.fix_type, gps.lat, gps.lon, gps.alt) for _, gps in messages} == {(1, 0, 0, 0)}
+
+
+@pytest.mark.parametrize(
+    ("name", "duration", "sensors", "cut", "back"),
+    [
+        ("drive1", 300.0, 150, 100.0, math.inf),
+        ("drive2", 800.0, 100, 400.0, 650.0),
+        ("ekf2", 300.0, 1, 100.0, math.inf),
+    ],
+)
+def test_gps_is_cut_where_the_scenario_says(name, duration, sensors, cut, back):
+    chosen = scenario(name, 7)
+    assert (chosen.duration, chosen.sensors, chosen.rate) == (duration, sensors, 100.0)
+    times, fixed = [], []
+    for message in autopilot.gps(chosen):
+        times.append((message.time_us - BOOT_US) / 1e6)
+        fixed.append(GPS.unpacker.unpack(message.payload)[FIX_TYPE] == 3)
+    expected = [not cut <= time_s < back for time_s in times]
+    assert fixed == expected
+    assert np.diff(times) == pytest.approx(0.2)

@@ -6,18 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from risaf_link.sim.disturbances import Thermal
+from risaf_link.sim.equipment import CONSUMER_GYROS
 from risaf_link.sim.receiver import ReceiverParameters, fixes
-from risaf_link.sim.scenario import CONSUMER_GYROS, PARAN
+from risaf_link.sim.routes import PARAN
 from risaf_link.sim.sensors import TriadArray, TriadErrors
 from risaf_link.sim.trajectory import Circle
 
-PERFECT = TriadErrors(0.0, 0.0, 0.0, 0.0, 0.0, math.inf)
+PERFECT = TriadErrors(0.0, 0.0, 0.0, math.inf)
 CIRCLE = Circle(PARAN, speed=10.0, radius=100.0)
 QUIET = ReceiverParameters(velocity_noise=0.0, position_noise=0.0, altitude_noise=0.0)
 
 
-def read(errors, samples, sensors, rate=100.0, truth=(0.0, 0.0, 0.0)):
-    array = TriadArray(errors, sensors, rate, np.random.default_rng(1))
+def read(errors, samples, sensors, rate=100.0, truth=(0.0, 0.0, 0.0), seed=1):
+    array = TriadArray(errors, sensors, rate, np.random.default_rng(seed))
     return array.read(np.tile(truth, (samples, 1)))
 
 
@@ -67,17 +69,25 @@ def test_the_bias_that_is_told_is_the_one_in_the_readings():
     assert (array.bias_b == readings[-1]).all()
 
 
-def test_spikes_come_as_often_and_as_large_as_told_to_both_sides():
-    spikes = read(replace(PERFECT, spike_probability=0.02, spike_amplitude=0.5), 1000, 100)
-    hits = spikes[spikes != 0]
-    expected = 0.02 * spikes.size
-    assert abs(len(hits) - expected) < 5 * math.sqrt(expected)
-    assert abs((hits > 0).mean() - 0.5) < 2.5 / math.sqrt(len(hits))
-    sizes = abs(hits)
-    assert sizes.min() >= 0.25
-    assert sizes.max() <= 0.75
-    assert abs(sizes.mean() - 0.5) < 5 * 0.5 / math.sqrt(12 * len(hits))
-    assert (spikes != 0).mean(axis=(0, 1)) == pytest.approx(0.02, abs=5 * math.sqrt(0.02 / 1e5))
+def test_biases_may_all_be_of_one_size():
+    biases = read(replace(PERFECT, initial_bias=0.01, equal_biases=True), 1, 1000)
+    assert (abs(biases) == 0.01).all()
+    assert abs((biases > 0).mean() - 0.5) < 2.5 / math.sqrt(biases.size)
+
+
+def test_a_sound_array_drifts_together_as_it_warms_up():
+    warming = Thermal(common=1.0, own=0.1, time_constant=50.0)
+    drift = read(replace(PERFECT, warming=warming), 2000, 400, rate=10.0)
+    assert (drift[0] == 0.0).all()
+    final = drift[-1] / (1 - math.exp(-199.9 / 50.0))
+    assert drift[500] == pytest.approx(final * (1 - math.exp(-1.0)))
+    assert within(final.std(axis=0).mean(), 0.1, 3 * 400)
+    common = [
+        read(replace(PERFECT, warming=replace(warming, own=0.0)), 2, 5, 1e-3, seed=seed)[1, :, 2]
+        for seed in range(300)
+    ]
+    assert np.ptp(common, axis=1).max() == 0.0
+    assert within(np.std(common), 1.0, 300)
 
 
 def test_no_reading_is_beyond_the_range():
@@ -125,6 +135,13 @@ def test_positions_err_slowly_and_as_much_as_the_receiver_says():
             assert within(error.std(), std, 20_000 / (2 * 60))
             step = std * math.sqrt(2 * (1 - math.exp(-0.2 / 60)))
             assert np.diff(error).std() == pytest.approx(step, rel=0.02)
+
+
+def test_positions_may_err_without_memory():
+    report = observe(ReceiverParameters(time_constant=0.0), 4000.0)
+    north = 6.37e6 * (report.latitude - CIRCLE(report.time_s).latitude)
+    assert within(north.std(), 1.5, len(north))
+    assert abs((north[1:] * north[:-1]).mean()) < 5 * 1.5**2 / math.sqrt(len(north))
 
 
 @pytest.mark.parametrize("speed", [1.0, 10.0])

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
-from risaf_link.sim.scenario import SCENARIOS
 from risaf_link.sim.trajectory import Circle, Place, sample_times
 
 START = Place(math.radians(30.2217), math.radians(34.8012), 300.0)
 CIRCLE = Circle(START, speed=10.0, radius=100.0)
-ON_EARTH = replace(CIRCLE, start=replace(START, earth_rate=EARTH_RATE))
+ON_EARTH = replace(CIRCLE, earth_rate=EARTH_RATE)
 
 
 def exponential(turns):
@@ -129,11 +128,3 @@ def test_sample_times_are_evenly_spaced_and_come_in_short_blocks(rate, duration,
     blocks = list(sample_times(rate, duration))
     assert max(len(block) for block in blocks) <= rate
     assert np.concatenate(blocks) == pytest.approx(np.arange(expected) / rate)
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_attitudes_are_unit_quaternions_without_a_jump(name):
-    chosen = SCENARIOS[name]
-    truth = chosen.trajectory(np.arange(0, chosen.duration, 0.1))
-    assert np.linalg.norm(truth.q_nb, axis=1) == pytest.approx(1.0, abs=1e-12)
-    assert np.linalg.norm(np.diff(truth.q_nb, axis=0), axis=1).max() < 0.1

@@ -4,11 +4,14 @@ A GPS message is stamped with the time of its arrival at the autopilot, as by PX
 is older by the receiver's latency.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from risaf_link.core.earth import GRAVITY
+from risaf_link.core.rotation import Floats
 from risaf_link.sim.message import AUTOPILOT, Message, table, whole
 from risaf_link.sim.readings import clock_us
 from risaf_link.sim.receiver import fixes
@@ -16,36 +19,53 @@ from risaf_link.sim.scenario import Scenario
 from risaf_link.sim.trajectory import sample_times
 
 TRUTH_RATE = 10.0  # Hz
+UNKNOWN = 2**16 - 1
 
 
 def gps(scenario: Scenario) -> Iterator[Message]:
-    """GPS_RAW_INT, as the receiver reports."""
+    """GPS_RAW_INT, as the receiver reports; without a fix it repeats its last position.
+
+    What is not known then has the value that MAVLink reserves for it; accuracies are those that
+    u-blox receivers tell without a fix.
+    """
     receiver = scenario.receiver
     f = fixes(scenario.trajectory, scenario.duration, receiver, scenario.generator("receiver"))
-    altitude_mm = whole(f.altitude * 1e3)
+    lost = is_lost(f.arrival_s, scenario.outages)
+    last = np.maximum.accumulate(np.where(lost, -1, np.arange(len(lost))))
+
+    def repeated(values: Floats) -> NDArray[np.int64]:
+        return np.where(last < 0, 0, whole(values)[last])
+
+    altitude_mm = repeated(f.altitude * 1e3)
     columns = {
         "time_usec": clock_us(f.arrival_s),
-        "lat": whole(np.degrees(f.latitude) * 1e7),
-        "lon": whole(np.degrees(f.longitude) * 1e7),
+        "lat": repeated(np.degrees(f.latitude) * 1e7),
+        "lon": repeated(np.degrees(f.longitude) * 1e7),
         "alt": altitude_mm,
         "alt_ellipsoid": altitude_mm,  # the geoid is taken for the ellipsoid
-        "vel": whole(f.speed * 1e2),
-        "cog": whole(np.degrees(f.course) * 1e2) % 36_000,
-        "hdg_acc": whole(np.degrees(f.course_std) * 1e5),
     }
-    return table(
-        AUTOPILOT,
-        "GPS_RAW_INT",
-        columns,
-        fix_type=3,  # GPS_FIX_TYPE_3D_FIX
-        eph=80,
-        epv=120,
-        satellites_visible=14,
-        h_acc=round(receiver.position_noise * 1e3),
-        v_acc=round(receiver.altitude_noise * 1e3),
-        vel_acc=round(receiver.velocity_noise * 1e3),
-        yaw=0,  # one antenna
-    )
+    known_or_not: dict[str, tuple[Any, int]] = {
+        "fix_type": (3, 1),  # GPS_FIX_TYPE_3D_FIX, GPS_FIX_TYPE_NO_FIX
+        "eph": (80, UNKNOWN),
+        "epv": (120, UNKNOWN),
+        "vel": (whole(f.speed * 1e2), UNKNOWN),
+        "cog": (whole(np.degrees(f.course) * 1e2) % 36_000, UNKNOWN),
+        "satellites_visible": (14, 0),
+        "h_acc": (round(receiver.position_noise * 1e3), 2**32 - 1),
+        "v_acc": (round(receiver.altitude_noise * 1e3), 2**32 - 1),
+        "vel_acc": (round(receiver.velocity_noise * 1e3), 20_000),
+        "hdg_acc": (whole(np.degrees(f.course_std) * 1e5), 18_000_000),
+    }
+    columns |= {name: np.where(lost, no, yes) for name, (yes, no) in known_or_not.items()}
+    return table(AUTOPILOT, "GPS_RAW_INT", columns, yaw=0)  # one antenna
+
+
+def is_lost(time_s: Floats, outages: Iterable[tuple[float, float]]) -> NDArray[np.bool_]:
+    """Whether times, shape (k,), seconds, are in an outage."""
+    lost = np.zeros(len(time_s), dtype=bool)
+    for start, end in outages:
+        lost |= (start <= time_s) & (time_s < end)
+    return lost
 
 
 def truth(scenario: Scenario) -> Iterator[Message]:

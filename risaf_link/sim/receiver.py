@@ -24,7 +24,7 @@ class ReceiverParameters:
     velocity_noise: float = 0.1  # m/s, standard deviation along each axis
     position_noise: float = 1.5  # m, standard deviation north and east
     altitude_noise: float = 3.0  # m; satellites are above only
-    time_constant: float = 60.0  # s, of the position error
+    time_constant: float = 60.0  # s, of the position error; 0: it is white
     latency: float = 0.11  # s from the instant that a fix describes to its arrival
 
 
@@ -88,7 +88,7 @@ def fixes(
 
 def _gauss_markov(count: int, samples: float, generator: np.random.Generator) -> Floats:
     """Unit processes along three axes, shape (count, 3), that forget within so many samples."""
-    kept = math.exp(-1.0 / samples)
+    kept = math.exp(-1.0 / samples) if samples else 0.0
     values = generator.standard_normal((count, 3))
     values[1:] *= math.sqrt(1.0 - kept * kept)
     for i in range(1, count):

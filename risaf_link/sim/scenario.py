@@ -1,21 +1,35 @@
 """The scenarios: which vehicle, which sensors, which faults."""
 
-import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from math import inf, radians
 from typing import Literal
 
 import numpy as np
 
 from risaf_link.errors import ConfigError
+from risaf_link.sim.disturbances import Ramps, Shocks
+from risaf_link.sim.equipment import (
+    CONSUMER_ACCELEROMETERS,
+    CONSUMER_GYROS,
+    EKF2_ACCELEROMETER,
+    EKF2_GYRO,
+    EKF2_RECEIVER,
+    WARMING,
+)
+from risaf_link.sim.failures import Frozen, Saturated
+from risaf_link.sim.faults import FAULTS, choose
 from risaf_link.sim.receiver import ReceiverParameters
+from risaf_link.sim.routes import OUTAGE, PARAN, hills, paved, unpaved
 from risaf_link.sim.sensors import TriadErrors
-from risaf_link.sim.trajectory import Circle, Place, Trajectory
+from risaf_link.sim.target import Fault
+from risaf_link.sim.trajectory import Circle, Trajectory
 
 BOOT_US = 1_000_000  # on the vehicle's clock at the start of every scenario
 LIMITS = {"sensors": (1, 1000), "rate": (1, 1000), "duration": (0.001, 86_400)}
 
-Part = Literal["gyros", "accelerometers", "receiver"]
-PARTS: tuple[Part, ...] = ("gyros", "accelerometers", "receiver")
+Part = Literal["gyros", "accelerometers", "receiver", "route", "victims"]
+PARTS: tuple[Part, ...] = ("gyros", "accelerometers", "receiver", "route", "victims")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +50,8 @@ class Scenario:
     duration: float  # s
     sensors: int
     rate: float  # Hz, epochs
+    faults: Mapping[str, Fault] = field(default_factory=dict)  # those that are on
+    outages: tuple[tuple[float, float], ...] = ()  # s; the receiver has no fix from, until
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -43,39 +59,22 @@ class Scenario:
             value = getattr(self, key)
             if not low <= value <= high:
                 raise ConfigError(f"{key}: {value}, expected {low} to {high}")
-        if self.seed < 0:
-            raise ConfigError(f"seed: {self.seed}, expected 0 or more")
 
-    def generator(self, part: Part) -> np.random.Generator:
-        """Make the generator of one part: no part's draws depend on another's."""
-        key = (PARTS.index(part),)
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
+    def generator(self, part: Part, *child: int) -> np.random.Generator:
+        """Make the generator of one part, or a child's: no part's draws depend on another's."""
+        return _generator(self.seed, part, *child)
 
 
-# Gyros as a calibrated array of consumer parts has them; the paper gives no numbers. Data sheet:
-# that of the MPU-6050, rev. 3.4, section 6.1.
-CONSUMER_GYROS = TriadErrors(
-    # Twice the data sheet's, which is that of one part at 10 Hz and rest: 0.1 deg/s a sample at
-    # 100 Hz, 0.6 deg/sqrt(h).
-    noise_density=math.radians(0.01),
-    # What calibration leaves from one power-up to the next; the data sheet allows 20 without.
-    initial_bias=math.radians(0.2),
-    # An Allan deviation of 0.017 deg/s at 100 s, as of a part whose temperature changes; 100 of
-    # them together turn 0.5 deg in 200 s without GPS.
-    bias_walk=math.radians(0.003),
-    # At 100 sensors one on each axis of an epoch, in the mean: there is never an epoch to rest.
-    spike_probability=0.01,
-    # 300 times the noise: the mean of 100 sensors becomes three times as noisy as one good sensor.
-    spike_amplitude=math.radians(30.0),
-    # The data sheet's smallest; a count is a thirteenth of the noise.
-    full_scale=math.radians(250.0),
-)
+def _generator(seed: int, part: Part, *child: int) -> np.random.Generator:
+    if seed < 0:
+        raise ConfigError(f"seed: {seed}, expected 0 or more")
+    key = (PARTS.index(part), *child)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
-# Where the drives of the paper started, section V.B; the altitude is no more than likely.
-PARAN = Place(math.radians(30.2217), math.radians(34.8012), altitude=300.0)
 
-SCENARIOS = {
-    "circle": Scenario(
+def _circle(_: np.random.Generator) -> Scenario:
+    """The paper's, section IV."""
+    return Scenario(
         "circle",
         # A turn a minute, as on a roundabout of 200 m: 0.1 g to the side.
         Circle(PARAN, speed=10.0, radius=100.0),
@@ -85,9 +84,72 @@ SCENARIOS = {
         duration=300.0,
         sensors=100,
         rate=100.0,
-    ),
+        faults={"spikes": FAULTS["spikes"]},
+    )
+
+
+def _drive1(generator: np.random.Generator) -> Scenario:
+    """Drive I of the paper, section V.B: constant speed, GPS cut after 100 s."""
+    return Scenario(
+        "drive1",
+        paved(generator),
+        CONSUMER_GYROS,
+        CONSUMER_ACCELEROMETERS,
+        receiver=ReceiverParameters(),
+        duration=300.0,
+        sensors=150,
+        rate=100.0,
+        faults={
+            "spikes": FAULTS["spikes"],
+            # Its sensor 60, figure 10: the relative bias goes astray, and further and further.
+            "ramps": Ramps(share=0.02, slope=radians(0.02), onset=(20.0, 150.0)),
+        },
+        outages=((100.0, inf),),
+    )
+
+
+def _drive2(generator: np.random.Generator) -> Scenario:
+    """Drive II of the paper, section V.B: an unpaved road, a third of the array shocked."""
+    return Scenario(
+        "drive2",
+        unpaved(generator),
+        replace(CONSUMER_GYROS, warming=WARMING),
+        CONSUMER_ACCELEROMETERS,
+        receiver=ReceiverParameters(),
+        duration=800.0,
+        sensors=100,
+        rate=100.0,
+        faults={
+            "shocks": Shocks(share=0.3, spacing=8.0, peak=radians(20.0), decay=0.3),
+            "frozen": Frozen(share=0.02, onset=(100.0, 500.0)),
+            "saturated": Saturated(share=0.01, onset=(100.0, 500.0)),
+        },
+        outages=(OUTAGE,),
+    )
+
+
+def _ekf2(generator: np.random.Generator) -> Scenario:
+    """A drive such as PX4's EKF2 was run on: one sound IMU."""
+    return Scenario(
+        "ekf2",
+        hills(generator),
+        EKF2_GYRO,
+        EKF2_ACCELEROMETER,
+        EKF2_RECEIVER,
+        duration=300.0,
+        sensors=1,
+        rate=100.0,
+        outages=((100.0, inf),),
+    )
+
+
+SCENARIOS: dict[str, Callable[[np.random.Generator], Scenario]] = {
+    "circle": _circle,
+    "drive1": _drive1,
+    "drive2": _drive2,
+    "ekf2": _ekf2,
 }
-"""Every scenario by its name. `circle` is the paper's, section IV."""
+"""Every scenario by its name; made with what is drawn for its route."""
 
 
 def scenario(
@@ -96,6 +158,7 @@ def scenario(
     duration: float | None = None,
     sensors: int | None = None,
     rate: float | None = None,
+    faults: Iterable[str] | None = None,
 ) -> Scenario:
     """Choose a scenario.
 
@@ -107,19 +170,24 @@ def scenario(
         Of everything random.
     duration, sensors, rate : optional
         Seconds, number, Hz; the scenario's own where None.
+    faults : iterable of str, optional
+        Those that are on, of `FAULTS`; `default` stands for the scenario's own, `none` for nothing.
+        The scenario's own where None. The drive, the noise and every other fault stay the same.
 
     Raises
     ------
     ConfigError
-        If there is no such scenario, or a value is outside of what can be simulated.
+        If there is no such scenario or fault, or a value is outside of what can be simulated.
     """
-    chosen = SCENARIOS.get(name)
-    if chosen is None:
+    make = SCENARIOS.get(name)
+    if make is None:
         raise ConfigError(f"scenario: {name!r}, expected one of {', '.join(SCENARIOS)}")
+    chosen = make(_generator(seed, "route"))
     return replace(
         chosen,
         seed=seed,
         duration=chosen.duration if duration is None else duration,
         sensors=chosen.sensors if sensors is None else sensors,
         rate=chosen.rate if rate is None else rate,
+        faults=choose(faults, chosen.faults),
     )

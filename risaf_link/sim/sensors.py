@@ -1,20 +1,23 @@
 """An array of triads (gyros or accelerometers) and its errors.
 
-A reading is the truth, plus a bias that walks, plus white noise, plus now and then a spike, held
+A reading is the truth, plus a bias that walks, plus white noise, plus what faults do to it, held
 within the sensor's range.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from risaf_link.core.rotation import Floats
+from risaf_link.sim.disturbances import Thermal
+from risaf_link.sim.target import Strike
 
 
 @dataclass(frozen=True, slots=True)
 class TriadErrors:
-    """What is wrong with every channel of an array, each on its own.
+    """What is wrong with every channel of a sound array, each on its own.
 
     The unit is the reading's: rad/s for gyros, m/s^2 for accelerometers.
     """
@@ -22,9 +25,9 @@ class TriadErrors:
     noise_density: float  # unit/sqrt(Hz), two-sided: one sample's noise is this times sqrt(rate)
     initial_bias: float  # unit, standard deviation over the channels
     bias_walk: float  # unit/sqrt(s)
-    spike_probability: float  # of each sample of each channel
-    spike_amplitude: float  # unit, mean size; both signs
     full_scale: float  # unit; no reading is larger
+    equal_biases: bool = False  # all start with the same size, and only the sign is random
+    warming: Thermal | None = None
 
 
 class TriadArray:
@@ -41,20 +44,33 @@ class TriadArray:
         Samples a second.
     generator : numpy.random.Generator
         Its children are used, not itself.
+    faults : sequence of Strike
+        What spoils the readings, one after another.
 
     Attributes
     ----------
     bias_b : ndarray, shape (sensors, 3)
-        The true bias at the last sample.
+        The true bias at the last sample; without what comes by warming and faults.
     """
 
     def __init__(
-        self, errors: TriadErrors, sensors: int, rate: float, generator: np.random.Generator
+        self,
+        errors: TriadErrors,
+        sensors: int,
+        rate: float,
+        generator: np.random.Generator,
+        faults: Sequence[Strike] = (),
     ) -> None:
         self._errors = errors
         self._rate = rate
-        initial, self._white, self._walk, self._hits, self._spikes = generator.spawn(5)
-        self.bias_b: Floats = initial.normal(0.0, errors.initial_bias, (sensors, 3))
+        self._samples = 0
+        initial, self._white, self._walk = generator.spawn(3)
+        bias_b = initial.normal(0.0, errors.initial_bias, (sensors, 3))
+        self.bias_b: Floats = bias_b
+        if errors.equal_biases:
+            self.bias_b = np.copysign(errors.initial_bias, bias_b)
+        warming = [errors.warming.drift(sensors, *initial.spawn(1))] if errors.warming else []
+        self._strikes = [*warming, *faults]
 
     def read(self, truth_b: Floats) -> Floats:
         """Take the next samples.
@@ -73,7 +89,10 @@ class TriadArray:
         readings += truth_b[:, np.newaxis]
         white = self._errors.noise_density * math.sqrt(self._rate)
         readings += white * self._white.standard_normal(shape)
-        self._add_spikes(readings)
+        time_s = np.arange(self._samples, self._samples + len(truth_b)) / self._rate
+        self._samples += len(truth_b)
+        for strike in self._strikes:
+            strike(time_s, truth_b, readings)
         limit = self._errors.full_scale
         return np.clip(readings, -limit, limit, out=readings)
 
@@ -86,9 +105,3 @@ class TriadArray:
         if len(biases):
             self.bias_b = biases[-1].copy()
         return biases
-
-    def _add_spikes(self, readings: Floats) -> None:
-        """Add spikes of half to one and a half times the mean size."""
-        hit = self._hits.random(readings.shape) < self._errors.spike_probability
-        shares = self._spikes.uniform(-1.0, 1.0, np.count_nonzero(hit))
-        readings[hit] += self._errors.spike_amplitude * (shares + np.copysign(0.5, shares))

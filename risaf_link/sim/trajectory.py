@@ -1,6 +1,5 @@
 """Where a simulated vehicle is, and what an ideal inertial sensor in it would read."""
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from risaf_link.core.rotation import Floats, matrix_from_quaternion
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The motion of a vehicle at k instants."""
+    """The motion of a vehicle at k instants; n is the local frame where it is."""
 
     time_s: Floats  # (k,) seconds from the start
     q_nb: Floats  # (k, 4) unit quaternions
@@ -22,25 +21,24 @@ class Truth:
     latitude: Floats  # (k,) rad
     longitude: Floats  # (k,) rad
     altitude: Floats  # (k,) m
+    frame_n: Floats  # (k, 3) rad/s, of n relative to inertial space
+    earth_n: Floats  # (k, 3) rad/s, of the earth
 
 
 Trajectory = Callable[[Floats], Truth]
-"""A vehicle's way: from times, shape (k,), seconds from the start, to the truth at them."""
+"""A vehicle's way: from times, shape (k,), seconds from the start, to the truth at them.
+
+It goes on before the start and after the end.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a trajectory starts; n is the plane that touches the earth here."""
+    """Where a trajectory starts."""
 
     latitude: float  # rad
     longitude: float  # rad
     altitude: float  # m
-    earth_rate: float = 0.0  # rad/s; EARTH_RATE for sensors that feel the earth turn
-
-    def earth_rate_n(self) -> Floats:
-        """Rate of the earth's rotation, shape (3,), rad/s."""
-        direction_n = [math.cos(self.latitude), 0.0, -math.sin(self.latitude)]
-        return self.earth_rate * np.array(direction_n)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,40 +47,53 @@ class Motion:
 
     q_nb: Floats  # (k, 4)
     turn_b: Floats  # (k, 3) rad/s, of the body relative to n
-    position_n: Floats  # (k, 3) m from the start
     velocity_n: Floats  # (k, 3) m/s
-    acceleration_n: Floats  # (k, 3) m/s^2
+    acceleration_n: Floats  # (k, 3) m/s^2, the derivative of the velocity's components
 
-    def truth(self, time_s: Floats, start: Place) -> Truth:
-        """Add the earth: its rotation, its gravity, its latitudes and longitudes.
+    def truth(self, time_s: Floats, where: Floats, frame_n: Floats, earth_n: Floats) -> Truth:
+        """Add the earth.
 
-        Gravity is the standard one, straight down. The transport rate, 0.3 deg/h at 10 m/s, is
-        left out: n stays the plane at the start.
+        Groves 2013, eq. 5.53, solved for the specific force. Gravity is the standard one, straight
+        down.
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (k,)
+            Seconds from the start.
+        where : ndarray, shape (k, 3)
+            Latitude and longitude, rad, altitude, m.
+        frame_n, earth_n : ndarray, shape (k, 3)
+            Rates of n and of the earth relative to inertial space, rad/s.
         """
-        earth_n = start.earth_rate_n()
-        coriolis_n = 2.0 * np.cross(earth_n, self.velocity_n)
+        coriolis_n = np.cross(frame_n + earth_n, self.velocity_n)
         force_n = self.acceleration_n + coriolis_n - [0.0, 0.0, GRAVITY]
         rotation_nb = matrix_from_quaternion(self.q_nb)
-        north, east = radii(start.latitude, start.altitude)
         return Truth(
             time_s=time_s,
             q_nb=self.q_nb,
-            rate_b=self.turn_b + np.einsum("kji,j->ki", rotation_nb, earth_n),
+            rate_b=self.turn_b + np.einsum("kji,kj->ki", rotation_nb, frame_n),
             force_b=np.einsum("kji,kj->ki", rotation_nb, force_n),
             velocity_n=self.velocity_n,
-            latitude=start.latitude + self.position_n[:, 0] / north,
-            longitude=start.longitude + self.position_n[:, 1] / east,
-            altitude=start.altitude - self.position_n[:, 2],
+            latitude=where[:, 0],
+            longitude=where[:, 1],
+            altitude=where[:, 2],
+            frame_n=frame_n,
+            earth_n=earth_n,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A level circle to the right at constant speed, from the start northward."""
+    """A level circle to the right at constant speed, from the start northward.
+
+    It lies in the plane that touches the earth at the start, and that is n throughout: the earth
+    does not curve, and turns only if it is told to.
+    """
 
     start: Place
     speed: float  # m/s
     radius: float  # m
+    earth_rate: float = 0.0  # rad/s; EARTH_RATE for sensors that feel the earth turn
 
     def __call__(self, time_s: Floats) -> Truth:
         """Evaluate the circle, in closed form."""
@@ -92,11 +103,23 @@ class Circle:
         motion = Motion(
             q_nb=_columns(np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)),
             turn_b=_columns(zero, zero, zero + turn),
-            position_n=self.radius * _columns(sin, 1.0 - cos, zero),
             velocity_n=self.speed * _columns(cos, sin, zero),
             acceleration_n=self.speed * turn * _columns(-sin, cos, zero),
         )
-        return motion.truth(time_s, self.start)
+        start = self.start
+        north, east = radii(start.latitude, start.altitude)
+        where = _columns(
+            start.latitude + self.radius * sin / north,
+            start.longitude + self.radius * (1.0 - cos) / east,
+            zero + start.altitude,
+        )
+        earth_n = self.earth_rate * earth_axis(np.full_like(yaw, start.latitude))
+        return motion.truth(time_s, where, earth_n, earth_n)
+
+
+def earth_axis(latitude: Floats) -> Floats:
+    """Direction of the earth's rotation in n, shape (k, 3)."""
+    return _columns(np.cos(latitude), np.zeros_like(latitude), -np.sin(latitude))
 
 
 def sample_times(rate: float, duration: float) -> Iterator[Floats]:
