@@ -91,7 +91,7 @@ def test_simulate_then_replay(tmp_path):
 
 
 def test_faults_of_the_sensors_can_be_switched(tmp_path):
-    logs = {faults: tmp_path / f"{faults}.tlog" for faults in ("none", "default", "frozen")}
+    logs = {faults: tmp_path / f"{faults}.tlog" for faults in ("none", "default", "scale")}
     for faults, log in logs.items():
         options = ("--duration", 2, "--faults", faults, "--out", log)
         assert call("simulate", "circle", "--seed", 1, *options).exit_code == 0
