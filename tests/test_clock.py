@@ -117,6 +117,14 @@ def test_the_least_delayed_frames_count(delays):
     assert bench.error_us(300_000) == 0
 
 
+def test_the_least_delayed_frame_counts_for_some_seconds():
+    bench = Bench()
+    for second in range(14):
+        bench.tell_time(0 if second == 5 else 300_000)
+        assert bench.error_us() == (0 if second >= 5 else -300_000)
+        bench.wait(1_000_000)
+
+
 @pytest.mark.parametrize("drift", [-200, 200])  # microseconds a second
 def test_clocks_that_drift_are_followed(drift):
     bench = Bench()

@@ -271,7 +271,7 @@ def test_a_frame_comes_with_its_last_byte(mix):
         *[frame[:-1] for frame in sequence("nothing known", 32, 3)],
     ],
 )
-def test_no_stream_costs_more_than_one_frames_checksum_a_byte(pattern, size, monkeypatch):
+def test_a_stream_of_marks_costs_at_most_one_frames_checksum_a_byte(pattern, size, monkeypatch):
     summed = 0
     checksum = frame_module.mcrf4xx
 

@@ -1,9 +1,9 @@
 """The vehicle's boot clock, for an array that counts its own time.
 
 Two clocks are compared through a third, the arrival time: of all that came within some seconds, the
-frame that was least delayed tells best how far a sender's clock is ahead of it. When a clock seems
-to jump it may be the third that was set, or a link may have stalled: the offset that was found
-before holds until both clocks have been compared with the third again.
+frame that was least delayed tells best how far a sender's clock is ahead of it. When the array's
+clock seems to jump, the third may have been set or the link may have stalled: the offset that was
+found before holds until the vehicle tells its time again.
 """
 
 from risaf_link.mavlink.dialect import IDS, reader
@@ -62,8 +62,7 @@ class VehicleClock:
                 self._autopilot = sender
         elif frame.message_id == IDS["SYSTEM_TIME"] and sender == self._autopilot:
             _, boot_ms = _SYSTEM_TIME(frame.payload)
-            if self._vehicle.note(boot_ms * 1000, received_us):
-                self._array = _Lead()
+            self._vehicle.note(boot_ms * 1000, received_us)
 
     def boot_us(self, time_us: int, received_us: int) -> int:
         """Time of an epoch, which has just been received, on the vehicle's clock."""

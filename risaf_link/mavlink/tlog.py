@@ -113,10 +113,7 @@ def _is_believable(stamp: int, last: int | None, following: Sequence[int]) -> bo
         return sum(stamp <= s < last for s in following) > half
     if stamp > last + LEAP_US:
         return sum(stamp <= s for s in following) > half
-    behind = following[0] if following else stamp
-    if last <= behind <= last + LEAP_US:
-        return stamp <= behind
-    return sum(last <= s < stamp for s in following) <= half
+    return not following or not last <= following[0] < stamp
 
 
 def _stamp(frame: Frame) -> int | None:
