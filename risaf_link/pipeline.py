@@ -15,9 +15,10 @@ from msgspec import Struct, field, structs
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.attitude import FILTERS, AttitudeParameters
 from risaf_link.core.estimate import ArrayStatus, Estimate
-from risaf_link.core.fusion import FUSIONS, Epoch, FusionParameters
+from risaf_link.core.fusion import FUSIONS, Epoch, Fusion, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import HealthMonitor
+from risaf_link.core.robust import Robust, RobustParameters
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
@@ -65,7 +66,7 @@ class Pipeline:
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
         self._clock = VehicleClock()
-        self._fusion = FUSIONS[p.fusion.method](p.fusion)
+        self._fusion = _fusion(p.fusion)
         self._health = HealthMonitor()
         self._filter = FILTERS[p.attitude.filter](p.attitude)
         self._heading = p.heading
@@ -158,3 +159,9 @@ class Pipeline:
             return epoch
         rates_b, forces_b = self._calibration.apply(epoch.rates_b, epoch.forces_b)
         return replace(epoch, rates_b=rates_b, forces_b=forces_b)
+
+
+def _fusion(parameters: FusionParameters) -> Fusion:
+    if parameters.method == "robust":
+        return Robust(RobustParameters())
+    return FUSIONS[parameters.method](parameters)

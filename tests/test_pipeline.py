@@ -7,6 +7,7 @@ import pytest
 from vehicle import Vehicle
 
 from risaf_link.core.estimate import Estimate
+from risaf_link.core.fusion import FusionParameters
 from risaf_link.core.heading import HeadingState
 from risaf_link.mavlink import risaf
 from risaf_link.mavlink.frame import Frame
@@ -20,9 +21,9 @@ PERIOD_US = 10_000
 class Drive:
     """A pipeline and a vehicle that feeds it, sample by sample; time is the vehicle's."""
 
-    def __init__(self, sensors: int = 5) -> None:
-        self.vehicle = Vehicle(sensors)
-        self.pipeline = Pipeline(PipelineParameters(), OWN)
+    def __init__(self, parameters: PipelineParameters | None = None) -> None:
+        self.vehicle = Vehicle(sensors=5)
+        self.pipeline = Pipeline(parameters or PipelineParameters(), OWN)
         self.time_us = 5_000_000
         self.take(self.vehicle.info())
 
@@ -158,3 +159,10 @@ def test_messages_are_thinned_out_on_the_estimates_own_time(drive):
     sent = [len(emitter.emit(drive.go(0.01))) for _ in range(1000)]
     assert sum(sent) == 200
     assert {sum(sent[k : k + 5]) for k in range(0, 1000, 5)} == {1}
+
+
+def test_the_robust_fusion_can_be_chosen():
+    fusion = FusionParameters(method="robust")
+    drive = Drive(parameters=PipelineParameters(fusion=fusion))
+    estimate = drive.go(6, rate_z=math.radians(9), course=1.0)
+    assert estimate.fused.rate_b == pytest.approx([0, 0, math.radians(9)], abs=1e-3)

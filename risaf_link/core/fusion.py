@@ -25,7 +25,7 @@ Croux, "Alternatives to the Median Absolute Deviation", JASA 88, 1993."""
 class FusionParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """How the sensors of an array become one rate."""
 
-    method: Literal["risaf", "median", "mean"] = "risaf"
+    method: Literal["risaf", "robust", "median", "mean"] = "risaf"
     alpha: Annotated[float, Meta(ge=0, lt=1)] = 0.995  # eq. 5, an epoch
     lower_quantile: Annotated[float, Meta(ge=0, le=0.5)] = 0.20  # eq. 6
     upper_quantile: Annotated[float, Meta(ge=0.5, le=1)] = 0.80

@@ -1,0 +1,412 @@
+"""Epoch -> RobustRate: one angular rate from an array of which up to 40 % may fail, in any way.
+
+Why not eq. 5 to 8
+------------------
+The mean in eq. 5 carries every spike into all relative biases, and a sensor's own bias absorbs its
+one-sided bursts; where the set of eq. 6 changes, they come back as drift. What an array can never
+see is the common mode of its biases: its error is the heading's. So everything below keeps the
+common mode as it is, unless there is evidence.
+
+What is done instead, for each channel of one axis; times are in seconds, not epochs
+-----------------------------------------------------------------------------------
+A channel is on the jury if it is valid and trusted; r_i is its reading less its relative bias.
+
+1. Fuse. Centre m and spread s: median and scaled median absolute deviation of the jury's r_i; s is
+   averaged over `NOISE_TIME`, or that of the epoch if greater (up to `SWELL`: noise may grow, but
+   of three sensors two may be struck at once). With |r_i - m| <= gate s a reading is inside; those
+   inside and trusted are active. The rate is their mean: w = m + mean(r_i - m).
+2. Learn. The relative bias b_i of an active channel follows its residual e_i = r_i - w:
+   b_i += dt / min(age_i, T) e_i. Of the active ones the residuals sum to zero and so do the steps:
+   the common mode stands still, whoever is active, and no explicit sum has to be held. A reading
+   that is rejected, or of a channel that is not trusted, teaches nothing; the bias waits for it.
+   So a burst is not absorbed, and a sensor that is hit now and then still tells, in between, how
+   its bias has walked against the others': its share of the common mode is not lost.
+3. Watch. z_i, the residuals inside low-passed, shows what no single reading does: a burst's tail, a
+   step, a drift, a scale. Alarms are |z_i - median z| beyond gate times the scaled median absolute
+   deviation of all z; more than `BURST` of the readings of a second rejected; a reading that does
+   not change; silence. The median and deviation are those of all channels that change, trusted or
+   not: however many are out, the bar does not close in on the rest.
+4. Trust. A channel is trusted once it has been `hold_time` without an alarm. One that has not been
+   trusted for `RELEARN` is taken to have changed for good, and learns its bias anew, as a new one
+   does: from all of its readings, without a say in the rate.
+
+If less than half of the valid channels, or less than three, are trusted, all that change are the
+jury, or if none does, all that are valid; it is active itself only where none of the trusted is
+inside. One or two sensors have no majority: their mean is taken, and neither is blamed but for
+silence or a reading that does not change.
+
+How certain the rate is
+-----------------------
+`variance` is that of the white part, a sample: (s^2 - V) / (active). s^2 is the mean over
+`NOISE_TIME` of the active residuals' sample variance (at 4 standard deviations, truncation takes
+0.1 % off it), V the mean square of their z: what relative biases are not learnt yet spreads the
+residuals, but hardly changes from one epoch to the next.
+`bias_walk` is how quickly the bias of the rate wanders, rad/s/sqrt(s). If a channel's bias walks
+by q, then V = q^2 T^2 / (2 (T + S)) + s^2 dt T / (2 S (T + S)), S the time constant of z, T at
+first two thirds of the time since the start; solved for q it gives q / sqrt(active). Each of c
+channels that have come or gone since the last epoch has moved the rate by about sqrt(V) / (active):
+c V / (active)^2 / dt is added to the square. A filter adds `variance * dt**2` to the angles'
+covariance and `bias_walk**2 * dt` to that of the bias of the rate.
+What all sensors have in common (the mean's bias at the start, its temperature, vibration rectified
+alike) no residual shows: the filter has to add what it knows of that.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from risaf_link.core.fusion import Epoch, FusedRate
+from risaf_link.core.rotation import Floats
+
+Bools = NDArray[np.bool_]
+
+LIMIT = 1e6  # rad/s; beyond, a reading is not one
+LONGEST = 0.1  # s; an epoch counts for no more, so after a gap nothing is judged at once
+WATCH_TIME = 3.0  # s, low pass of z: far below T, long enough to see a tenth of the noise
+BURST_TIME, BURST = 1.0, 0.2  # s and share rejected: 1 % of spikes is no burst, 0.2 s of shock is
+SWELL = 3.0  # times the spread of late: what the spread of an epoch may be, if noise has grown
+NOISE_TIME = 2.0  # s, of averaging the noise: vibration comes and goes in seconds
+SPREAD_TIME = 30.0  # s, of averaging the spread of z: ten times its low pass
+FROZEN_AFTER = 0.5  # s; at a noise of one count, 50 equal readings have a chance of 1e-27
+SILENT_AFTER = 1.0  # s
+RELEARN = 30.0  # s; bursts are over by then
+DEAD_AFTER = 60.0  # s without trust: it did not come back when it had learnt anew
+TINY = 1e-9  # s
+LEAST_WHITE = 0.1  # share of the residuals' variance that is white at least: V is an estimate
+PRIOR = 3.0  # sensors that the prior of the bias walk counts as
+
+MAD_TO_STD = 1.4826 * np.array(
+    [1.0, 1.0, 1.196, 1.495, 1.363, 1.206, 1.200, 1.140, 1.129, 1.107]
+    + [n / (n - 0.8) for n in range(10, 1001)]
+)
+"""By their number, what makes the median absolute deviation of Gaussian values their standard
+deviation. Croux and Rousseeuw, "Time-Efficient Algorithms for Two Highly Robust Estimators of
+Scale", 1992."""
+
+
+class RobustParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is known beforehand of an array; the defaults are for gyros, in rad/s.
+
+    Attributes
+    ----------
+    gate : float
+        Robust standard deviations from the rest beyond which a reading is rejected, and a residual
+        is an alarm. 4: of Gaussian readings one in 16000; a smaller one costs good sensors.
+    bias_time : float
+        T, s, in which relative biases are learnt. Long against bursts, of which the undetected part
+        is absorbed in proportion to 1 / T; short against the hours of ageing and temperature.
+    hold_time : float
+        Seconds without an alarm that make a sensor trusted: some decay times of a burst's tail. A
+        longer one costs the sensors that are hit often: at 20 s most never come back.
+    resolution : float
+        No sensor is blamed for less; several counts' worth of rounding.
+    bias_walk : float
+        Of one sensor, per sqrt(s): prior, for small arrays.
+    """
+
+    gate: Annotated[float, Meta(ge=2)] = 4.0
+    bias_time: Annotated[float, Meta(ge=5)] = 100.0
+    hold_time: Annotated[float, Meta(ge=0)] = 5.0
+    resolution: Annotated[float, Meta(ge=0)] = 3e-4
+    bias_walk: Annotated[float, Meta(ge=0)] = 5e-5
+
+
+class SensorState(IntEnum):
+    """A sensor's standing, as RISAF_SENSOR_STATE."""
+
+    HEALTHY = 0
+    SUSPECT = 1
+    DEAD = 2
+
+
+class Reason(IntEnum):
+    """Why a sensor is not healthy; of several, the greatest is told."""
+
+    NONE = 0
+    SETTLING = 1  # new, or back: not long enough without an alarm
+    WANDERING = 2  # its bias has left the others': a step, a drift, a scale
+    OUTLYING = 3  # too many of its readings are rejected
+    FROZEN = 4  # its reading does not change; so does one at the end of its range
+    SILENT = 5  # no valid reading
+
+
+@dataclass(frozen=True, slots=True)
+class RobustRate(FusedRate):
+    """The array as one gyro; `variance` is that of the rate's white part."""
+
+    bias_walk: Floats  # (3,) rad/s/sqrt(s): wander of the rate's bias
+
+
+@dataclass(slots=True)
+class Channels:
+    """What is remembered of each channel, shape (3, n); times in s."""
+
+    reading: Floats  # the last one
+    bias: Floats  # relative, rad/s
+    age: Floats  # how long the bias has been learnt
+    slow: Floats  # z: low-passed residual, rad/s
+    rejected: Floats  # share of its readings, of about a second
+    unchanged: Floats  # for how long the reading has been
+    silent: Floats  # for how long
+    calm: Floats  # since the last alarm
+    out: Floats  # since it was last trusted
+    wandering: Floats  # 1: z is an alarm
+
+    @classmethod
+    def new(cls, n: int) -> "Channels":
+        """Make n sensors of which nothing is known: they are learnt like those that are back."""
+        channels = cls(*(np.zeros((3, n)) for _ in fields(cls)))
+        channels.reading += np.nan
+        channels.out += RELEARN
+        return channels
+
+    def resized(self, n: int) -> "Channels":
+        """The same with n sensors: the last are forgotten, or new ones added that must settle."""
+        new = Channels.new(max(0, n - self.bias.shape[1]))
+        return Channels(
+            *(np.hstack([getattr(self, f.name)[:, :n], getattr(new, f.name)]) for f in fields(self))
+        )
+
+
+class Robust:
+    """Fuses an array of gyros, or of accelerometers in their unit, robustly.
+
+    Parameters
+    ----------
+    parameters : RobustParameters
+    """
+
+    def __init__(self, parameters: RobustParameters) -> None:
+        self._parameters = parameters
+        self._channels = Channels.new(0)
+        self._trusted: Bools = np.zeros((3, 0), dtype=bool)
+        self._elapsed = 0.0  # s
+        self._spread = np.zeros((3, 1))  # s, robust standard deviation of one reading
+        self._slow_spread = np.zeros((3, 1))  # that of z
+        self._noise = np.full(3, np.nan)  # variance of one active reading
+
+    @property
+    def relative_bias(self) -> Floats:
+        """Relative bias of each sensor, shape (n, 3), rad/s."""
+        return self._channels.bias.T.copy()
+
+    @property
+    def rejected(self) -> Floats:
+        """Share of each sensor's readings rejected in the last second, its worst axis, (n,)."""
+        worst: Floats = self._channels.rejected.max(axis=0)
+        return worst
+
+    @property
+    def reason(self) -> NDArray[np.int8]:
+        """`Reason` of each sensor, its worst axis, shape (n,)."""
+        c = self._channels
+        reason = np.where(self._trusted, Reason.NONE, Reason.SETTLING).astype(np.int8)
+        reason[c.wandering > 0] = Reason.WANDERING
+        reason[c.rejected > BURST] = Reason.OUTLYING
+        reason[c.unchanged > FROZEN_AFTER] = Reason.FROZEN
+        reason[c.silent > 0] = Reason.SILENT
+        worst: NDArray[np.int8] = reason.max(axis=0)
+        return worst
+
+    @property
+    def state(self) -> NDArray[np.int8]:
+        """`SensorState` of each sensor, shape (n,).
+
+        Dead: unchanged, or for a second silent, or for a minute not trusted.
+        """
+        c = self._channels
+        dead = (c.unchanged > FROZEN_AFTER) | (c.silent > SILENT_AFTER) | (c.out > DEAD_AFTER)
+        suspect = self.reason > Reason.NONE
+        return np.where(dead.any(axis=0), SensorState.DEAD, suspect).astype(np.int8)
+
+    def fuse(self, epoch: Epoch) -> RobustRate:
+        """Fuse the next epoch; its number of sensors may differ from the one before."""
+        return self.fuse_readings(epoch.time_us, epoch.dt, epoch.rates_b)
+
+    def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> RobustRate:
+        """Fuse what sensors of one kind read at one instant.
+
+        Parameters
+        ----------
+        time_us : int
+        dt : float
+            Seconds since the last; at the first it does not matter.
+        readings : ndarray, shape (n, 3)
+            rad/s; for accelerometers all units are theirs. Not valid where not finite.
+        """
+        dt = min(dt, LONGEST) if dt > 0 and self._trusted.size else 0.0
+        self._resize(len(readings))
+        self._elapsed += dt
+        raw = readings.T.copy()
+        valid = np.abs(raw) < LIMIT
+        changing = self._note_changes(raw, valid, dt)
+        trusted = self._trusted & changing
+        jury = _jury(trusted, changing, valid)
+
+        corrected = np.where(valid, raw - self._channels.bias, 0.0)
+        centre = _median(corrected, jury)
+        offset = corrected - centre
+        distance = np.abs(offset)
+        inside = (distance <= self._limit(distance, jury, dt)) & valid
+        active = trusted & inside
+        count = active.sum(axis=1)
+        if not count.all():  # where none of the trusted is inside, the rest of the jury
+            active |= jury & inside & (count == 0)[:, None]
+            count = active.sum(axis=1)
+        mean = (offset * active).sum(axis=1) / np.maximum(count, 1)
+        residual = offset - mean[:, None]
+
+        self._average_noise(residual * active, count, dt)
+        self._learn(residual, active, changing, dt)
+        self._watch(residual * inside, valid ^ inside, changing, dt)
+        moved = self._trust(dt)
+        known = np.where(count > 0, count, np.nan)
+        slow = self._slow_square(active, known)
+        white = np.maximum(self._noise - slow, LEAST_WHITE * self._noise)
+        return RobustRate(
+            time_us,
+            centre[:, 0] + mean + 0.0 * known,
+            white / known,
+            count,
+            int(valid.all(axis=0).sum()),
+            self._bias_walk(white, slow, known, moved, dt),
+        )
+
+    def _note_changes(self, readings: Floats, valid: Bools, dt: float) -> Bools:
+        """Which channels are valid and have changed of late."""
+        c = self._channels
+        c.unchanged += dt
+        c.unchanged *= readings == c.reading
+        c.silent += dt
+        c.silent *= ~valid
+        c.reading = readings
+        return valid & (c.unchanged <= FROZEN_AFTER)
+
+    def _limit(self, distance: Floats, jury: Bools, dt: float) -> Floats:
+        """How far from the centre of the jury a reading is inside; shape (3, 1)."""
+        p = self._parameters
+        usual = np.maximum(self._spread, p.resolution)
+        spread = _deviation(distance, jury)
+        if self._elapsed > 0:
+            spread = np.minimum(spread, SWELL * usual)
+        self._spread += self._share(dt, NOISE_TIME) * (spread - self._spread)
+        nearest = np.where(jury, distance, np.inf).min(axis=1, initial=np.inf, keepdims=True)
+        widest = np.maximum(np.maximum(spread, self._spread), p.resolution)
+        limit: Floats = np.maximum(p.gate * widest, nearest)
+        return limit
+
+    def _average_noise(self, residual: Floats, count: NDArray[np.int64], dt: float) -> None:
+        square = np.einsum("ij,ij->i", residual, residual) / np.maximum(count - 1, 1)
+        known = np.where(np.isnan(self._noise), square, self._noise)
+        averaged = known + self._share(dt, NOISE_TIME) * (square - known)
+        self._noise = np.where(count > 1, averaged, self._noise)
+
+    def _learn(self, residual: Floats, active: Bools, changing: Bools, dt: float) -> None:
+        """Let relative biases follow the residuals: the trusted if active, the new always."""
+        c = self._channels
+        learning = self._trusted & active
+        relearning = c.out >= RELEARN
+        if relearning.any():
+            learning |= relearning & changing
+        elapsed = learning * dt
+        c.age += elapsed
+        c.bias += elapsed / np.clip(c.age, TINY, self._parameters.bias_time) * residual
+
+    def _watch(self, residual: Floats, rejected: Bools, changing: Bools, dt: float) -> None:
+        """See which channels are wandering, and how much of them is rejected."""
+        c = self._channels
+        c.slow += dt / WATCH_TIME * (residual - c.slow)
+        c.rejected += dt / BURST_TIME * (rejected - c.rejected)
+        distance = np.abs(c.slow - _median(c.slow, changing))
+        white = self._spread * math.sqrt(dt / (2 * WATCH_TIME))
+        spread = np.maximum(_deviation(distance, changing), white)
+        self._slow_spread += self._share(dt, SPREAD_TIME) * (spread - self._slow_spread)
+        widest = np.maximum(spread, self._slow_spread)
+        np.greater(distance, self._parameters.gate * widest, out=c.wandering)
+
+    def _trust(self, dt: float) -> NDArray[np.int64]:
+        """Judge every channel anew; how many of each axis have come or gone."""
+        c = self._channels
+        alarm = c.rejected > BURST
+        alarm |= c.wandering > 0.0
+        alarm |= c.unchanged > FROZEN_AFTER
+        alarm |= c.silent > SILENT_AFTER
+        c.calm += dt
+        c.calm *= ~alarm
+        trusted = c.calm >= self._parameters.hold_time
+        c.out += dt
+        c.out *= ~trusted
+        late = c.out >= RELEARN
+        if late.any():
+            anew = late & ((c.out < RELEARN + dt) | (c.age >= RELEARN))
+            c.age[anew] = 0.0
+            c.slow[anew] = 0.0
+        moved: NDArray[np.int64] = (trusted ^ self._trusted).sum(axis=1)
+        self._trusted = trusted
+        return moved
+
+    def _slow_square(self, active: Bools, count: Floats) -> Floats:
+        """V, the mean square of z of the active channels."""
+        slow = self._channels.slow * active
+        square: Floats = np.einsum("ij,ij->i", slow, slow) / np.maximum(count - 1, 1)
+        return square
+
+    def _bias_walk(
+        self, white: Floats, slow: Floats, count: Floats, moved: NDArray[np.int64], dt: float
+    ) -> Floats:
+        """rad/s/sqrt(s), as the head of this module says."""
+        p = self._parameters
+        time = min(max(2 / 3 * self._elapsed, WATCH_TIME), p.bias_time)
+        noise = np.where(np.isnan(white), 0.0, white)
+        walk = 2 * (time + WATCH_TIME) / time**2 * slow - dt / (WATCH_TIME * time) * noise
+        walk = (PRIOR * p.bias_walk**2 + count * np.maximum(walk, 0.0)) / (PRIOR + count)
+        if dt > 0 and moved.any():
+            walk += moved / (count * dt) * slow
+        density: Floats = np.sqrt(walk / count)
+        return density
+
+    def _share(self, dt: float, time_constant: float) -> float:
+        """Weight of the newest in an average over a time constant; at first, over all there is."""
+        return dt / min(self._elapsed, time_constant) if self._elapsed > 0 else 1.0
+
+    def _resize(self, n: int) -> None:
+        known = self._trusted.shape[1]
+        if n == known:
+            return
+        self._channels = self._channels.resized(n)
+        if not known:  # the first: all are trusted until they give cause for alarm
+            self._channels.calm += self._parameters.hold_time
+            self._channels.out[:] = 0.0
+        self._trusted = self._channels.calm >= self._parameters.hold_time
+
+
+def _jury(trusted: Bools, changing: Bools, valid: Bools) -> Bools:
+    """Those of each axis who say what is outlying: the trusted, or if they are too few, more."""
+    few = trusted.sum(axis=1) < np.maximum(3, valid.sum(axis=1) / 2)
+    if not few.any():
+        return trusted
+    more = np.where(changing.any(axis=1, keepdims=True), changing, valid)
+    return np.where(few[:, None], more, trusted)
+
+
+def _median(values: Floats, chosen: Bools) -> Floats:
+    """Median of the chosen values of each row, shape (k, 1); 0 where none is."""
+    if not values.size:
+        return np.zeros((len(values), 1))
+    ordered = np.sort(np.where(chosen, values, np.inf), axis=1)  # quicker than a partition
+    count = chosen.sum(axis=1)
+    rows = np.arange(len(values))
+    twice = ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, count // 2]
+    return np.where(count > 0, 0.5 * twice, 0.0)[:, None]
+
+
+def _deviation(distance: Floats, chosen: Bools) -> Floats:
+    """Robust standard deviation of the chosen of each row, from their distance to the centre."""
+    count = np.minimum(chosen.sum(axis=1, keepdims=True), len(MAD_TO_STD) - 1)
+    deviation: Floats = MAD_TO_STD[count] * _median(distance, chosen)
+    return deviation
