@@ -1,0 +1,885 @@
+"""FusedRate -> AttitudeState: an error-state filter on SO(3), aided by heading, gravity and rest.
+
+The error is a small rotation in the navigation frame, `R_nb = exp(angle_n) R_nb_estimated`, and the
+error of the gyro bias (Sola, "Quaternion kinematics for the error-state Kalman filter",
+arXiv:1711.02508, chapter 7: global angular errors). In that frame
+
+- the error stays as it is while the body turns: only the bias drives it, `-R_nb bias`;
+- gravity sees the angles about north and east, never that about down, whatever the attitude: yaw,
+  which is not observed before the first heading, cannot leak into the tilt (Barrau and Bonnabel,
+  "Intrinsic filtering on Lie groups with applications to attitude estimation", arXiv:1310.2539);
+- a late heading is compared with the attitude of its own time: every correction since then is a
+  rotation on the left, which that attitude takes just as well.
+
+`Aiding`, at the end, finds gravity and rest in the array's readings, with the speed that GPS tells.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from risaf_link.core.attitude import AttitudeState, Innovation
+from risaf_link.core.earth import EARTH_RATE, GRAVITY
+from risaf_link.core.fusion import FusedRate
+from risaf_link.core.rotation import Floats, wrap
+
+ATTITUDE = slice(0, 3)  # error: rotation vector, rad, NED
+BIAS = slice(3, 6)  # error of the fused rate's bias, rad/s, body
+DOWN = 2
+LEVEL, BIAS_AXES = np.arange(2), np.arange(3, 6)  # for diagonals
+IDENTITY = np.eye(6)
+
+HISTORY = 1024  # epochs; a second at 1 kHz
+LONG_STEP = 0.5  # s; over a longer one nothing is known of the rate
+UNKNOWN_RATE = 0.5  # rad/s, standard deviation of what a vehicle may do unseen
+LARGEST_RATE = 1e3  # rad/s; no gyro measures more
+LARGEST_STEP = 3600.0  # s; afterwards nothing is known anyway
+LARGEST_GAP = 2.5  # s; what is further apart is not one run
+STEEP = 0.99  # sine of the pitch beyond which a heading says nothing of yaw: 82 deg
+
+PART, PARTS = 0.1, 30  # s, and their number in a mean of specific force
+HIDDEN_TIME = 1.0  # s for which one lasts that drives it
+LARGEST_FORCE = 1e4  # m/s^2; no accelerometer measures more
+ACCELERATION_STD = 1.5  # m/s^2, of a vehicle along its way
+ACCELERATION_TIME = 2.0  # s for which it lasts
+SPEED_LOST = 15.0  # m/s, standard deviation beyond which a speed says nothing
+SPEED_JUMP = 1.0  # m/s; a speed that changes by more at once was wrong before
+STANDING_SPEED = 0.5  # m/s; GPS shows half of it where nothing moves
+BLOCK = 0.5  # s, of rest
+STILL, STILL_ALONE, STILL_ON_ROAD = 1.0, 3.0, 6.0  # s: GPS confirms, was never there, is gone
+QUIET = np.array([0.05] * 3 + [0.5] * 3)  # rad/s, m/s^2, standard deviation within a block
+LOOSE = np.array([0.01] * 3 + [0.2] * 3)  # rad/s, m/s^2, between blocks, with GPS
+STRICT = np.array([3e-4] * 3 + [0.01] * 3)  # without
+REST_RATE, UNCONFIRMED_RATE = 1e-4, 1e-3  # rad/s, of a vehicle at rest: wind, people
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class EskfParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """What the filter assumes of the array and of the world. Defaults: consumer MEMS."""
+
+    gyro_noise_density: Annotated[float, Meta(gt=0)] = 2e-4
+    """rad/s/sqrt(Hz), of one sensor; for an axis whose sensors do not tell (fewer than two)."""
+    common_noise_density: Annotated[float, Meta(ge=0)] = 2e-5
+    """rad/s/sqrt(Hz), that no averaging takes away: vibration, the board's own motion."""
+    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6
+    """rad/s/sqrt(s), of one sensor: 0.02 deg/s in an hour; averages out over the sensors."""
+    common_bias_walk: Annotated[float, Meta(ge=0)] = 5e-7
+    """rad/s/sqrt(s), of all sensors together: the board's temperature."""
+    turn_error: Annotated[float, Meta(ge=0)] = 2e-3
+    """rad for each sqrt(rad) turned: scale factor and misalignment left after calibration."""
+    initial_bias_std: Annotated[float, Meta(gt=0)] = 0.01
+    """rad/s: 0.6 deg/s, the zero-rate offset of a good consumer gyro."""
+    initial_tilt_std: Annotated[float, Meta(gt=0)] = 0.05
+    """rad, where no accelerometer tells: a road vehicle stands level within 3 deg."""
+    accel_bias_std: Annotated[float, Meta(gt=0)] = 0.05
+    """m/s^2: 5 mg, of an accelerometer calibrated once; it tilts the apparent vertical by 0.3
+    deg."""
+    gate: Annotated[float, Meta(gt=0)] = 5.0
+    """Standard deviations within which gravity and rest are fused."""
+    gravity_distrust: Annotated[float, Meta(gt=0)] = 3.0
+    """s of rejection after which the tilt, not gravity, is held to be wrong."""
+    distrust: Annotated[float, Meta(gt=0)] = 10.0
+    """s of rejection after which yaw, or at rest the bias, is held to be wrong."""
+    reversing: Annotated[float, Meta(gt=0)] = 60.0
+    """s for which a vehicle may drive backwards: a course opposite to yaw is no reason for
+    distrust."""
+
+
+class Outcome(IntEnum):
+    """What came of a measurement."""
+
+    FUSED = 0
+    RESET = 1
+    """The state was set by it."""
+    REJECTED = 2
+    """Beyond the gate."""
+    NOT_FINITE = 3
+    """NaN, infinite or of a size that nothing real has."""
+    UNOBSERVABLE = 4
+    """A heading while the vehicle points up or down."""
+
+
+@dataclass(frozen=True, slots=True)
+class Correction(Innovation):
+    """An innovation, and what came of it."""
+
+    source: str = ""
+    outcome: Outcome = Outcome.FUSED
+
+    @property
+    def fused(self) -> bool:
+        """Whether the measurement was used."""
+        return self.outcome in {Outcome.FUSED, Outcome.RESET}
+
+
+@dataclass(frozen=True, slots=True)
+class Gravity:
+    """What the accelerometers say of the vertical."""
+
+    gravity_n: Floats  # (3,) m/s^2, by the filter's attitude; (0, 0, g) if that is right
+    forward: float  # (m/s^2)^2, variance of its part along the vehicle's heading
+    right: float  # (m/s^2)^2, variance of its part across
+    lever: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    """s: integral of `R_nb` from the time of the measurement; by it the bias has turned since."""
+
+
+class Eskf:
+    """Error-state Kalman filter of attitude and gyro bias.
+
+    Yaw is unknown until the first heading sets it; tilt until the first gravity does.
+
+    Parameters
+    ----------
+    parameters : EskfParameters
+    """
+
+    def __init__(self, parameters: EskfParameters) -> None:
+        p = self._parameters = parameters
+        self._by_rate: Quaternion = (1.0, 0.0, 0.0, 0.0)  # the rate's integral alone
+        self._correction: Quaternion = (1.0, 0.0, 0.0, 0.0)  # on its left: q_nb is their product
+        self._bias = np.zeros(3)
+        self._rate = np.zeros(3)
+        self._turned: Vector = (0.0, 0.0, 0.0)  # rotation vector of the last step
+        tilt = p.initial_tilt_std**2
+        bias = p.initial_bias_std**2
+        self._covariance = np.diag([tilt, tilt, math.pi**2, bias, bias, bias])
+        self._latitude = math.nan
+        self._aligned = False
+        self._levelled = False
+        self._resets = 0
+        self._elapsed = 0.0  # s
+        self._history: deque[tuple[float, Quaternion]] = deque(maxlen=HISTORY)
+        self._rejecting: dict[str, tuple[float, float]] = {}  # source: since when, last
+        self._rested = -math.inf  # when rest was last fused
+
+    def set_latitude(self, latitude: float) -> None:
+        """Tell where on earth the vehicle is, rad; before, the earth does not turn."""
+        if abs(latitude) <= math.pi / 2:
+            self._latitude = latitude
+
+    @property
+    def quaternion(self) -> Floats:
+        """`q_nb` as of the last predict."""
+        return np.array(self._attitude)
+
+    @property
+    def matrix(self) -> Floats:
+        """`R_nb` as of the last predict."""
+        return _matrix(self._attitude)
+
+    @property
+    def matrix_ib(self) -> Floats:
+        """`R_ib` as of the last predict: i is n at the start, carried on by the rate alone."""
+        return _matrix(self._by_rate)
+
+    @property
+    def matrix_ni(self) -> Floats:
+        """`R_ni`: all corrections, and the earth's rotation, until now."""
+        return _matrix(self._correction)
+
+    @property
+    def rate(self) -> Floats:
+        """Rate as of the last predict, rad/s, bias taken off."""
+        return self._rate
+
+    @property
+    def _at_rest(self) -> bool:
+        return self._elapsed - self._rested < LARGEST_GAP
+
+    @property
+    def _attitude(self) -> Quaternion:
+        return _product(self._correction, self._by_rate)
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance of the error, (6, 6): `ATTITUDE`, `BIAS`.
+
+        That of the accelerometers' bias, which no correction takes away, is added to the tilt.
+        """
+        covariance = self._covariance.copy()
+        if self._levelled:
+            covariance[LEVEL, LEVEL] += (self._parameters.accel_bias_std / GRAVITY) ** 2
+        return covariance
+
+    def predict(self, fused: FusedRate, dt: float) -> None:
+        """Carry the state on to the time of a fused rate.
+
+        The rate is held to be the mean over the step, as that of a gyro with a filter is; what the
+        axis of rotation turned from step to step is put right (coning, Savage, "Strapdown inertial
+        navigation integration algorithm design, part 1: attitude algorithms", 1998).
+
+        Parameters
+        ----------
+        fused : FusedRate
+            The rate over the time since the state; its variance and number of sensors make the
+            process noise. On an axis where it is not finite, nothing is known of the rotation.
+        dt : float
+            That time, seconds. A step that is not positive is no step.
+        """
+        if not dt > 0:
+            return
+        dt = min(dt, LARGEST_STEP)
+        known = np.abs(fused.rate_b) < LARGEST_RATE  # false for NaN
+        self._rate = np.where(known, fused.rate_b - self._bias, 0.0)
+        before = self._attitude
+        self._by_rate = _unit(_product(self._by_rate, _exp(self._rotation(dt))))
+        x, y, z = self._earth_rate()
+        self._turn((-x * dt, -y * dt, -z * dt))
+        self._elapsed += dt
+        self._history.append((self._elapsed, self._by_rate))
+        matrix_nb = _matrix(_between(before, self._attitude, 0.5))
+        self._spread(matrix_nb, fused, known.tolist(), dt)
+
+    def correct_heading(
+        self, heading: float, variance: float, age: float, gate: float
+    ) -> Correction:
+        """Fuse a heading; the first one sets yaw.
+
+        After `distrust` seconds of rejection it sets yaw again, unless the vehicle seems to be
+        driving backwards.
+
+        Parameters
+        ----------
+        heading, variance : float
+            rad from true north, and rad^2.
+        age : float
+            How long ago it was valid, seconds. It is compared with the yaw of that time.
+        gate : float
+            Standard deviations of the innovation beyond which a heading is rejected.
+        """
+        if not _usable(heading, variance, age):
+            return Correction(heading, variance, gate, False, "heading", Outcome.NOT_FINITE)
+        matrix_then = _matrix(self._attitude_before(age))
+        error = wrap(heading - math.atan2(matrix_then[1, 0], matrix_then[0, 0]))
+        if abs(matrix_then[2, 0]) > STEEP:
+            spread = float(self._covariance[DOWN, DOWN]) + variance
+            return Correction(error, spread, gate, False, "heading", Outcome.UNOBSERVABLE)
+        if not self._aligned:
+            return self.reset_heading(heading, variance, age, gate)
+        rows = (_yaw_row(matrix_then, age),)
+        (correction,) = self._fuse_all("heading", rows, (error,), (variance,), gate)
+        if not correction.fused and self._distrusts_yaw(error):
+            return self.reset_heading(heading, variance, age, gate)
+        return correction
+
+    def reset_heading(self, heading: float, variance: float, age: float, gate: float) -> Correction:
+        """Set yaw by a heading, whatever it was; the tilt and the bias stay."""
+        if not _usable(heading, variance, age):
+            return Correction(heading, variance, gate, False, "heading", Outcome.NOT_FINITE)
+        error = wrap(heading - _yaw(self._attitude_before(age)))
+        spread = float(self._covariance[DOWN, DOWN]) + variance
+        self._turn((0.0, 0.0, error))
+        cosine, sine = math.cos(error), math.sin(error)
+        rotation = IDENTITY.copy()
+        rotation[0:2, 0:2] = [[cosine, -sine], [sine, cosine]]
+        rotation[DOWN, DOWN] = 0.0  # what was known of yaw, and its part in all else
+        self._covariance = rotation @ self._covariance @ rotation.T
+        self._covariance[DOWN, DOWN] = min(variance, math.pi**2)
+        if not self._aligned:
+            self._doubt_bias_for_earth_rate()
+        self._aligned = True
+        self._resets += 1
+        self._rejecting.pop("heading", None)
+        return Correction(error, spread, gate, True, "heading", Outcome.RESET)
+
+    def correct_gravity(self, gravity: Gravity) -> tuple[Correction, ...]:
+        """Fuse the direction of gravity; the first one sets the tilt.
+
+        The rotation from the vertical that the accelerometers show to the filter's own is measured
+        about the vehicle's heading and across it: two scalars, fused if both are within the gate.
+        A tilt that gravity contradicts for `gravity_distrust` seconds is doubted: its variance
+        becomes as large as the contradiction.
+        """
+        north, east, down = (float(part) for part in gravity.gravity_n)
+        gate = self._parameters.gate
+        level, size = math.hypot(north, east), math.hypot(north, east, down)
+        sound = 0.1 * GRAVITY < size < LARGEST_FORCE
+        if not sound or not all(0 < v < LARGEST_FORCE**2 for v in (gravity.forward, gravity.right)):
+            return (Correction(size, 1.0, gate, False, "gravity", Outcome.NOT_FINITE),)
+        # The rotation vector that takes the measured vertical to down: its axis is level.
+        angle = math.atan2(level, down) / level if level > 1e-9 * size else 1.0 / size
+        about_n = np.array([east * angle, -north * angle])
+        scale = 1.0 / size**2
+        if not self._levelled:
+            return self._level(about_n, max(gravity.forward, gravity.right) * scale)
+        yaw = _yaw(self._attitude)
+        rows = np.zeros((2, 6))
+        rows[:, 0:2] = [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
+        rows[:, BIAS] = rows[:, ATTITUDE] @ gravity.lever
+        errors = [float(row[0:2] @ about_n) for row in rows]
+        variances = [gravity.right * scale, gravity.forward * scale]
+        corrections = self._fuse_all("gravity", tuple(rows), errors, variances, gate)
+        patience = 0.0 if self._at_rest else self._parameters.gravity_distrust
+        if self._distrusts("gravity", patience):
+            self._covariance[LEVEL, LEVEL] += errors[0] ** 2 + errors[1] ** 2
+            return self._fuse_all("gravity", tuple(rows), errors, variances, gate)
+        return corrections
+
+    def correct_zero_rate(
+        self, rate_b: Floats, variance: Floats, confirmed: bool
+    ) -> tuple[Correction, ...]:
+        """Fuse the mean rate of a vehicle at rest: its bias, and the earth's rotation.
+
+        Parameters
+        ----------
+        rate_b, variance : ndarray, shape (3,)
+            Mean of the fused rate, bias not taken off, rad/s, and its variance.
+        confirmed : bool
+            Whether GPS says that the vehicle stands. Then a bias that is contradicted for
+            `distrust` seconds is doubted.
+        """
+        p = self._parameters
+        sound = (np.abs(rate_b) < LARGEST_RATE) & (variance > 0) & (variance < LARGEST_RATE**2)
+        if not sound.all():
+            return (Correction(math.nan, 1.0, p.gate, False, "rest", Outcome.NOT_FINITE),)
+        error = rate_b - self._bias - np.array(self._earth_rate()) @ self.matrix
+        rows = tuple(IDENTITY[BIAS])
+        variances = variance.tolist()
+        corrections = self._fuse_all("rest", rows, error.tolist(), variances, p.gate)
+        if corrections[0].fused:
+            self._rested = self._elapsed
+        elif confirmed and self._distrusts("rest", p.distrust):
+            self._covariance[BIAS_AXES, BIAS_AXES] += float(error @ error)
+            return self._fuse_all("rest", rows, error.tolist(), variances, p.gate)
+        return corrections
+
+    def state(self, time_us: int) -> AttitudeState:
+        """Read the estimate as of the last predict."""
+        q_nb = self.quaternion
+        matrix_nb = self.matrix
+        rows = np.array([*_tilt_rows(matrix_nb), _yaw_row(matrix_nb, 0.0)[ATTITUDE]])
+        variance = ((rows @ self.covariance[ATTITUDE, ATTITUDE]) * rows).sum(axis=1)
+        roll, pitch, yaw = np.minimum(np.sqrt(variance), math.pi).tolist()
+        return AttitudeState(
+            time_us,
+            q_nb,
+            self._rate.copy(),
+            self._bias.copy(),
+            roll,
+            pitch,
+            yaw if self._aligned else math.pi,
+            self._aligned,
+            self._resets,
+        )
+
+    def _rotation(self, dt: float) -> Vector:
+        """Rotation vector of a step, from the rate of this step and of the one before."""
+        x, y, z = (self._rate * dt).tolist()
+        a, b, c = self._turned if dt < LONG_STEP else (0.0, 0.0, 0.0)
+        self._turned = (x, y, z)
+        return (
+            x + (b * z - c * y) / 12.0,
+            y + (c * x - a * z) / 12.0,
+            z + (a * y - b * x) / 12.0,
+        )
+
+    def _spread(self, matrix_nb: Floats, fused: FusedRate, known: list[bool], dt: float) -> None:
+        """Carry the covariance on: `angle' = angle - R_nb dt bias`, and the noise of both."""
+        angle, walk = self._noise(fused, known, dt)
+        transition = IDENTITY.copy()
+        transition[ATTITUDE, BIAS] = matrix_nb * -dt
+        covariance = transition @ self._covariance @ transition.T
+        covariance[ATTITUDE, ATTITUDE] += (matrix_nb * angle) @ matrix_nb.T
+        covariance[BIAS_AXES, BIAS_AXES] += walk
+        self._covariance = (covariance + covariance.T) / 2.0
+        self._bound()
+
+    def _noise(
+        self, fused: FusedRate, known: list[bool], dt: float
+    ) -> tuple[list[float], list[float]]:
+        """Variances that a step adds to angle (rad^2) and bias ((rad/s)^2), each axis of the body.
+
+        The fused rate's white noise is that of one sensor over their number.
+        """
+        p = self._parameters
+        common = p.common_noise_density**2 * dt + p.turn_error**2 * math.hypot(*self._turned)
+        angle, walk = [], []
+        axes = zip(fused.variance.tolist(), fused.active.tolist(), known, strict=True)
+        for variance, active, is_known in axes:
+            sensors = max(active, 1)
+            told = 0.0 <= variance < LARGEST_RATE**2  # false for NaN
+            noise = variance * dt * dt if told else p.gyro_noise_density**2 * dt
+            unknown = 0.0 if is_known and dt <= LONG_STEP else (UNKNOWN_RATE * dt) ** 2
+            angle.append(noise / sensors + common + unknown)
+            walk.append((p.bias_walk**2 / sensors + p.common_bias_walk**2) * dt)
+        return angle, walk
+
+    def _bound(self) -> None:
+        """Let no angle be less known than not at all: pi. Scaling keeps the matrix positive."""
+        covariance = self._covariance
+        if max(covariance[0, 0], covariance[1, 1], covariance[2, 2]) > math.pi**2:
+            scale = np.ones(6)
+            scale[ATTITUDE] = np.minimum(math.pi / np.sqrt(covariance.diagonal()[ATTITUDE]), 1.0)
+            self._covariance = covariance * np.outer(scale, scale)
+
+    def _earth_rate(self) -> Vector:
+        """Rate of the earth, rad/s, NED; its horizontal part only where north is known."""
+        if math.isnan(self._latitude):
+            return (0.0, 0.0, 0.0)
+        north = EARTH_RATE * math.cos(self._latitude) if self._aligned else 0.0
+        return (north, 0.0, -EARTH_RATE * math.sin(self._latitude))
+
+    def _doubt_bias_for_earth_rate(self) -> None:
+        """Until north is known, the earth's horizontal rate was taken for bias."""
+        if not math.isnan(self._latitude):
+            level = (EARTH_RATE * math.cos(self._latitude)) ** 2
+            matrix_nb = self.matrix
+            self._covariance[BIAS, BIAS] += level * (matrix_nb.T * [1.0, 1.0, 0.0]) @ matrix_nb
+
+    def _level(self, about_n: Floats, variance: float) -> tuple[Correction, ...]:
+        """Set the tilt, whatever it was; yaw and the bias stay."""
+        gate = self._parameters.gate
+        spreads = (self._covariance.diagonal()[0:2] + variance).tolist()
+        self._turn((float(about_n[0]), float(about_n[1]), 0.0))
+        for axis in (0, 1):
+            self._covariance[axis, :] = self._covariance[:, axis] = 0.0
+            self._covariance[axis, axis] = min(variance, math.pi**2)
+        self._levelled = True
+        return tuple(
+            Correction(float(error), spread, gate, True, "gravity", Outcome.RESET)
+            for error, spread in zip(about_n, spreads, strict=True)
+        )
+
+    def _turn(self, angle_n: Vector) -> None:
+        """Turn the attitude, and with it its history, about axes of NED."""
+        self._correction = _unit(_product(_exp(angle_n), self._correction))
+
+    def _fuse_all(
+        self,
+        source: str,
+        rows: Sequence[Floats],
+        errors: Sequence[float],
+        variances: Sequence[float],
+        gate: float,
+    ) -> tuple[Correction, ...]:
+        """Fuse scalars of one measurement one after another, if all are within the gate."""
+        spreads = [
+            float(row @ self._covariance @ row) + variance
+            for row, variance in zip(rows, variances, strict=True)
+        ]
+        passed = all(
+            error * error <= gate * gate * spread
+            for error, spread in zip(errors, spreads, strict=True)
+        )
+        self._note(source, passed)
+        change = np.zeros(6)
+        if passed:
+            for row, error, variance in zip(rows, errors, variances, strict=True):
+                change += self._gain(row, variance) * (error - float(row @ change))
+            self._turn((float(change[0]), float(change[1]), float(change[2])))
+            self._bias = self._bias + change[BIAS]
+        outcome = Outcome.FUSED if passed else Outcome.REJECTED
+        return tuple(
+            Correction(error, spread, gate, False, source, outcome)
+            for error, spread in zip(errors, spreads, strict=True)
+        )
+
+    def _gain(self, row: Floats, variance: float) -> Floats:
+        """Gain of a scalar measurement; the covariance is updated in the form of Bucy and Joseph.
+
+        As a sum of squares it stays symmetric and positive.
+        """
+        column = self._covariance @ row
+        gain: Floats = column / (float(row @ column) + variance)
+        remaining = IDENTITY - np.outer(gain, row)
+        covariance = remaining @ self._covariance @ remaining.T + variance * np.outer(gain, gain)
+        self._covariance = (covariance + covariance.T) / 2.0
+        return gain
+
+    def _note(self, source: str, passed: bool) -> None:
+        """Keep account of runs of rejections: when they began, and the last one."""
+        if passed:
+            self._rejecting.pop(source, None)
+            return
+        began, last = self._rejecting.get(source, (self._elapsed, self._elapsed))
+        if self._elapsed - last > LARGEST_GAP:
+            began = self._elapsed
+        self._rejecting[source] = (began, self._elapsed)
+
+    def _distrusts(self, source: str, after: float) -> bool:
+        began, last = self._rejecting.get(source, (math.inf, self._elapsed))
+        return last == self._elapsed and last - began >= after
+
+    def _distrusts_yaw(self, error: float) -> bool:
+        """Whether yaw is wrong, not the headings; a vehicle may drive backwards for a while."""
+        p = self._parameters
+        backwards = math.cos(error) < -math.sqrt(0.5) and not self._at_rest
+        return self._distrusts("heading", p.reversing if backwards else p.distrust)
+
+    def _attitude_before(self, age: float) -> Quaternion:
+        """Attitude of `age` seconds ago, as known now; the oldest where that is too long ago."""
+        time = self._elapsed - age
+        later: tuple[float, Quaternion] | None = None
+        for earlier in reversed(self._history):
+            if earlier[0] <= time:
+                break
+            later = earlier
+        else:
+            earlier = later or (time, self._by_rate)
+        by_rate = earlier[1]
+        if later and later[0] > earlier[0]:
+            part = (time - earlier[0]) / (later[0] - earlier[0])
+            by_rate = _between(by_rate, later[1], part)
+        return _product(self._correction, by_rate)
+
+
+def _usable(heading: float, variance: float, age: float) -> bool:
+    return math.isfinite(heading) and 0 < variance < math.inf and 0 <= age < math.inf
+
+
+def _yaw_row(matrix_nb: Floats, age: float) -> Floats:
+    """Yaw's derivative by the error, `age` after the attitude, shape (6,).
+
+    With the forward axis x: `d yaw = angle_D - x_D (x_N angle_N + x_E angle_E) / (x_N^2 + x_E^2)`;
+    the angle of then is that of now and what the bias has done since.
+    """
+    row = np.zeros(6)
+    row[DOWN] = 1.0
+    north, east, down = matrix_nb[:, 0].tolist()
+    level = max(north * north + east * east, 1.0 - STEEP**2)
+    row[0], row[1] = -down * north / level, -down * east / level
+    row[BIAS] = row[ATTITUDE] @ matrix_nb * age
+    return row
+
+
+def _tilt_rows(matrix_nb: Floats) -> tuple[Floats, Floats]:
+    """Derivatives of roll and pitch by the angles about north, east, down, shape (3,) each."""
+    north, east, _ = matrix_nb[:, 0].tolist()
+    level = max(north * north + east * east, 1e-12)
+    cosine = math.sqrt(level)
+    return np.array([north, east, 0.0]) / level, np.array([-east, north, 0.0]) / cosine
+
+
+def _product(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Hamilton product p (x) q."""
+    a, b, c, d = p
+    w, x, y, z = q
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+
+
+def _exp(angle: Vector) -> Quaternion:
+    """Quaternion of a rotation vector (Sola, eq. 101)."""
+    x, y, z = angle
+    norm = math.sqrt(x * x + y * y + z * z)
+    part = math.sin(norm / 2.0) / norm if norm > 1e-9 else 0.5
+    return math.cos(norm / 2.0), part * x, part * y, part * z
+
+
+def _unit(q: Quaternion) -> Quaternion:
+    w, x, y, z = q
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    return w / norm, x / norm, y / norm, z / norm
+
+
+def _between(p: Quaternion, q: Quaternion, part: float) -> Quaternion:
+    """Attitude between two that are a sample apart; of a linear rotation, to the third order."""
+    a, b, c, d = p
+    w, x, y, z = q
+    return _unit((a + part * (w - a), b + part * (x - b), c + part * (y - c), d + part * (z - d)))
+
+
+def _yaw(q: Quaternion) -> float:
+    w, x, y, z = q
+    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def _matrix(q: Quaternion) -> Floats:
+    """`R_nb` of a unit quaternion."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+class SpeedTracker:
+    """Speed and its derivative, from speeds over ground that come late and seldom.
+
+    A Kalman filter of two states; the acceleration forgets itself, a Gauss-Markov process.
+    """
+
+    def __init__(self) -> None:
+        self._since_told = math.inf  # s
+        self._start(0.0, math.inf)
+
+    def _start(self, speed: float, variance: float) -> None:
+        self.speed = speed  # m/s
+        self.acceleration = 0.0  # m/s^2, along the vehicle
+        self.speed_variance = variance
+        self.acceleration_variance = ACCELERATION_STD**2
+        self._common = 0.0  # their covariance
+
+    @property
+    def known(self) -> bool:
+        """Whether a speed was ever told: that of a vehicle."""
+        return self.speed_variance < math.inf
+
+    @property
+    def recent(self) -> bool:
+        """Whether GPS tells the speed."""
+        return self._since_told < LARGEST_GAP
+
+    @property
+    def standing(self) -> bool:
+        """Whether GPS says that the vehicle stands."""
+        return self.recent and self.speed < STANDING_SPEED
+
+    def advance(self, dt: float) -> None:
+        """Let time pass, seconds."""
+        self._since_told += dt
+        keep = math.exp(-dt / ACCELERATION_TIME)
+        self.speed_variance += dt * (2.0 * self._common + dt * self.acceleration_variance)
+        self._common = keep * (self._common + dt * self.acceleration_variance)
+        self.speed += dt * self.acceleration
+        self.acceleration *= keep
+        change = self.acceleration_variance - ACCELERATION_STD**2
+        self.acceleration_variance = ACCELERATION_STD**2 + keep**2 * change
+
+    def hear(self, speed: float, variance: float, age: float) -> None:
+        """Use a speed over ground, m/s, of `age` seconds ago, and its variance."""
+        if not (0 <= speed < 1e3 and 0 < variance < 1e6 and 0 <= age < 10):
+            return
+        self._since_told = 0.0
+        if not self.speed_variance < SPEED_LOST**2:
+            self._start(speed, variance)
+            return
+        by_speed = self.speed_variance - age * self._common
+        by_acceleration = self._common - age * self.acceleration_variance
+        spread = by_speed - age * by_acceleration + variance
+        error = speed - (self.speed - age * self.acceleration)
+        self.speed += by_speed / spread * error
+        self.acceleration += by_acceleration / spread * error
+        self.speed_variance -= by_speed**2 / spread
+        self.acceleration_variance -= by_acceleration**2 / spread
+        self._common -= by_speed * by_acceleration / spread
+
+
+class GravityFinder:
+    """Makes gravity from specific force: means over seconds, and how far they can be believed.
+
+    In a frame that does not turn, the mean specific force is gravity and the mean acceleration
+    (Laidig and Seel, "VQF: highly accurate IMU orientation estimation with bias estimation and
+    magnetic disturbance rejection", arXiv:2203.17024). What shakes a vehicle comes to nothing; the
+    more so the more smoothly the mean begins and ends (a Hann window). Of what lasts, GPS tells
+    what the speed and the rate make (along: its derivative; across: speed times rate). The rest
+    shows itself in two ways: means differ, and the specific force is not of gravity's size,
+    `|f|^2 - g^2 = |a|^2` for a level acceleration.
+    """
+
+    def __init__(self, accel_bias_std: float) -> None:
+        self._bias_std = accel_bias_std
+        self._size = GRAVITY
+        self._doubt = 2.0 * GRAVITY * accel_bias_std  # (m/s^2)^2, of the square of the size
+        self._last: Floats | None = None  # the mean before, m/s^2, NED
+        self._speed = 0.0  # m/s, at the epoch before
+        self._unsteady = 0.0  # (m/s^2)^2, variance of the means, each axis
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was measured: the attitude between is not known."""
+        self._parts: deque[Floats] = deque(maxlen=PARTS)  # integrals of force and R_ib, turn, time
+        self._new = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._part = np.zeros((3, 4))
+        self._turned = self._time = 0.0
+
+    def take(
+        self, attitude: Eskf, force_b: Floats, dt: float, speed: SpeedTracker
+    ) -> Gravity | None:
+        """Use the specific force of one epoch; the gravity of a window that it completes."""
+        if not (np.abs(force_b) < LARGEST_FORCE).all():
+            return None
+        matrix_ib = attitude.matrix_ib
+        _, rate_y, rate_z = attitude.rate.tolist()
+        if speed.speed_variance < speed.speed**2:
+            gained = speed.speed - self._speed
+            along = gained / dt if abs(gained) < SPEED_JUMP else 0.0
+            force_b = force_b - (along, speed.speed * rate_z, -speed.speed * rate_y)
+        self._speed = speed.speed
+        self._part[:, 0] -= matrix_ib @ force_b * dt
+        self._part[:, 1:] += matrix_ib * dt
+        self._time += dt
+        self._turned += rate_z * dt
+        if self._time < PART:
+            return None
+        self._parts.append(np.array([*self._part.ravel(), self._turned, self._time]))
+        self._new += 1
+        self._begin()
+        if self._last is not None and self._new < PARTS // 2:
+            return None
+        self._new = 0
+        return self._judge(attitude.matrix_ni, speed)
+
+    def learn_size(self, size: float) -> None:
+        """Take note that the vehicle stands: of this size, m/s^2, is gravity, and it is steady."""
+        if abs(size - GRAVITY) < 0.1 * GRAVITY:
+            self._size += 0.2 * (size - self._size)
+            self._doubt = max(0.8 * self._doubt, 0.4 * GRAVITY * self._bias_std)
+        self._unsteady = 0.0
+
+    def _judge(self, matrix_ni: Floats, speed: SpeedTracker) -> Gravity:
+        parts = np.array(self._parts)
+        times = parts[:, 13]
+        weights = np.hanning(len(parts) + 2)[1:-1] * times
+        weights /= weights.sum()
+        integrals = parts[:, :12].reshape(-1, 3, 4)
+        mean_n = matrix_ni @ (weights @ (integrals[:, :, 0] / times[:, np.newaxis]))
+        since = np.cumsum(weights) - weights / 2.0  # share of the mean older than each part
+        lever = matrix_ni @ np.einsum("k,kij->ij", since, integrals[:, :, 1:])
+        span = float(times.sum()) / 2.0  # that the window is worth
+        change = mean_n - (mean_n if self._last is None else self._last)
+        self._last = mean_n
+        now = float(change @ change) / 5.0  # of 3 axes, 1/6 of each in common
+        self._unsteady += 0.2 * (now - self._unsteady)
+        hidden = abs(float(mean_n @ mean_n) - self._size**2)
+        lasting = max(2.0 * HIDDEN_TIME / span, 1.0)
+        along = across = max(hidden - self._doubt, 0.0)
+        if speed.known:
+            turning = float(parts[:, 12] @ parts[:, 12] / (times @ times))
+            along = min(hidden + self._doubt, speed.acceleration_variance)
+            across = min(hidden + self._doubt, turning * speed.speed_variance)
+        known = self._bias_std**2 + max(self._unsteady, now)
+        return Gravity(mean_n, known + lasting * along, known + lasting * across, lever)
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The mean rate of a vehicle at rest."""
+
+    rate_b: Floats  # (3,) rad/s
+    variance: Floats  # (3,) (rad/s)^2
+    size: float  # m/s^2, of the specific force; NaN: there is no accelerometer
+    confirmed: bool  # by GPS
+
+
+class RestFinder:
+    """Finds rest in the array's readings, by blocks.
+
+    At rest the readings are a constant and noise. With GPS that says so it is enough that nothing
+    shakes or changes much. Without it a smooth road looks alike: then the noise must be white (the
+    mean square of successive differences is twice the variance: von Neumann, "Distribution of the
+    ratio of the mean square successive difference to the variance", 1941), and the means of blocks
+    must agree for long, to what noise allows.
+    """
+
+    def __init__(self) -> None:
+        self._reference: Floats | None = None
+        self._still = 0.0  # s
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new block."""
+        self._values: list[Floats] = []
+        self._time = 0.0
+
+    def take(self, rate_b: Floats, force_b: Floats, dt: float, speed: SpeedTracker) -> Rest | None:
+        """Use one epoch; the rest that a block which it completes shows.
+
+        Parameters
+        ----------
+        rate_b, force_b : ndarray, shape (3,)
+            rad/s, bias not taken off, and m/s^2; NaN: no accelerometer.
+        dt : float
+            s.
+        speed : SpeedTracker
+        """
+        self._values.append(np.concatenate((rate_b, force_b)))
+        self._time += dt
+        if self._time < BLOCK or len(self._values) < 5:
+            return None
+        values, time = np.array(self._values), self._time
+        self.restart()
+        with np.errstate(invalid="ignore"):
+            return self._judge(values, time, speed)
+
+    def _judge(self, values: Floats, time: float, speed: SpeedTracker) -> Rest | None:
+        if np.isnan(values[:, 3:]).any():
+            values = values[:, :3]
+        n, axes = values.shape
+        mean, variance = values.mean(axis=0), values.var(axis=0)
+        noise = (np.diff(values, axis=0) ** 2).mean(axis=0) / 2.0
+        standing = speed.standing
+        allowed = (LOOSE if standing else STRICT)[:axes]
+        quiet = (variance < QUIET[:axes] ** 2).all() and np.isfinite(mean).all()
+        if not standing:
+            white = 1.0 - min(4.0 / math.sqrt(n), 0.7)  # the ratio within 4 standard deviations
+            quiet &= bool((variance * white < noise + 1e-9).all()) and not speed.recent
+        reference = self._reference
+        agree = (
+            reference is not None
+            and len(reference) == axes
+            and (np.abs(mean - reference) < allowed + 5.0 * np.sqrt(2.0 * noise / n)).all()
+        )
+        if not (quiet and agree):
+            self._reference, self._still = mean if quiet else None, 0.0
+            return None
+        self._still += time
+        if self._still < (STILL if standing else STILL_ON_ROAD if speed.known else STILL_ALONE):
+            return None
+        floor = REST_RATE if standing else UNCONFIRMED_RATE
+        size = float(np.linalg.norm(mean[3:])) if axes > 3 else math.nan
+        return Rest(mean[:3], np.maximum(noise, variance)[:3] / n + floor**2, size, standing)
+
+
+class Aiding:
+    """Feeds a filter with what the array and the speed tell of gravity and rest.
+
+    Parameters
+    ----------
+    parameters : EskfParameters
+    """
+
+    def __init__(self, parameters: EskfParameters) -> None:
+        self.speed = SpeedTracker()
+        self._gravity = GravityFinder(parameters.accel_bias_std)
+        self._rest = RestFinder()
+
+    def take(
+        self, attitude: Eskf, fused: FusedRate, force_b: Floats, dt: float
+    ) -> tuple[Correction, ...]:
+        """Correct the attitude after a predict, where there is something to correct it by.
+
+        Parameters
+        ----------
+        attitude : Eskf
+        fused : FusedRate
+        force_b : ndarray, shape (3,)
+            Specific force, m/s^2; NaN: there is no accelerometer.
+        dt : float
+            Seconds since the epoch before.
+        """
+        if not dt > 0:
+            return ()
+        self.speed.advance(min(dt, LARGEST_STEP))
+        if dt > LONG_STEP or not np.isfinite(fused.rate_b).all():
+            self._gravity.restart()
+            self._rest.restart()
+            return ()
+        corrections: tuple[Correction, ...] = ()
+        rest = self._rest.take(fused.rate_b, force_b, dt, self.speed)
+        if rest is not None:
+            corrections += attitude.correct_zero_rate(rest.rate_b, rest.variance, rest.confirmed)
+            if corrections[0].fused:
+                self._gravity.learn_size(rest.size)
+        gravity = self._gravity.take(attitude, force_b, dt, self.speed)
+        if gravity is not None:
+            corrections += attitude.correct_gravity(gravity)
+        return corrections
