@@ -74,6 +74,6 @@ class HeadingPlot:
                 label="without GPS",
             )
             axes.grid(alpha=0.3)
-            axes.legend(loc="upper left", markerscale=4)
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=4)
         figure.savefig(path, dpi=120)
         plt.close(figure)
