@@ -103,8 +103,9 @@ class Scorer:
         """Take the next estimate."""
         self._last = estimate
         yaw = estimate.attitude.euler[2]
-        self._by_boot.add(estimate.boot_us, yaw)
-        self._by_arrival.add(received_us, yaw)
+        if estimate.attitude.aligned:
+            self._by_boot.add(estimate.boot_us, yaw)
+            self._by_arrival.add(received_us, yaw)
         self._follow_outage(estimate)
         while self._pending and self._is_due(*self._pending[0]):
             track, time_us, true_yaw = self._pending.popleft()
