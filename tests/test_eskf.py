@@ -101,7 +101,7 @@ def test_a_constant_rate_turns_by_its_integral_however_it_is_sampled(parts):
 
 
 def test_coning_of_a_vibrating_axis_is_carried_to_the_third_order():
-    """A cone of half-angle a turned at w drifts by w (1 - cos a) (Savage 1998)."""
+    """A cone of half-angle a turned at w drifts by w (1 - cos a)."""
     half, rate, dt, seconds = math.radians(2.0), 60.0, 0.005, 2.0
     estimator = Eskf(DEFAULTS)
     steps = round(seconds / dt)

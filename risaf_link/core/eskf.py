@@ -213,8 +213,8 @@ class Eskf:
         """Carry the state on to the time of a fused rate.
 
         The rate is held to be the mean over the step, as that of a gyro with a filter is; what the
-        axis of rotation turned from step to step is put right (coning, Savage, "Strapdown inertial
-        navigation integration algorithm design, part 1: attitude algorithms", 1998).
+        axis of rotation turned from step to step is put right (coning: Savage, "Computational
+        Elements for Strapdown Systems", RTO-SET-116, 2008).
 
         Parameters
         ----------
@@ -571,7 +571,7 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 def _exp(angle: Vector) -> Quaternion:
-    """Quaternion of a rotation vector (Sola, eq. 101)."""
+    """Quaternion of a rotation vector."""
     x, y, z = angle
     norm = math.sqrt(x * x + y * y + z * z)
     part = math.sin(norm / 2.0) / norm if norm > 1e-9 else 0.5
@@ -775,9 +775,8 @@ class RestFinder:
 
     At rest the readings are a constant and noise. With GPS that says so it is enough that nothing
     shakes or changes much. Without it a smooth road looks alike: then the noise must be white (the
-    mean square of successive differences is twice the variance: von Neumann, "Distribution of the
-    ratio of the mean square successive difference to the variance", 1941), and the means of blocks
-    must agree for long, to what noise allows.
+    mean square of successive differences is twice the variance), and the means of blocks must agree
+    for long, to what noise allows.
     """
 
     def __init__(self) -> None:
