@@ -17,6 +17,7 @@ from risaf_link.mavlink.ingest import Ingest, truth_of
 from risaf_link.mavlink.tlog import TlogReader
 
 GAP = 1.0  # s, between epochs
+REORDERED = 128  # a larger step of the sequence number is a frame out of order
 
 
 @dataclass
@@ -126,9 +127,6 @@ def _count(
     sequences[sender] = frame.sequence
     if missing < REORDERED:
         found.frames_lost[sender] = found.frames_lost.get(sender, 0) + missing
-
-
-REORDERED = 128  # a larger step of the sequence number is a frame out of order
 
 
 def verdict(found: Survey) -> str:

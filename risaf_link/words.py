@@ -9,6 +9,7 @@ from rich.table import Table
 
 from risaf_link.survey import Survey, verdict
 
+MOST_GAPS = 20
 REFERENCES = {"truth": "truth", "gps": "withheld GPS", None: "nothing to compare with"}
 
 
@@ -69,9 +70,6 @@ def survey_text(log: Path, found: Survey) -> str:
         verdict(found),
     ]
     return "\n".join(lines)
-
-
-MOST_GAPS = 20
 
 
 def _count(number: int) -> str:

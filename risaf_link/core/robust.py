@@ -60,7 +60,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from risaf_link.core.fusion import Epoch, FusedRate
+from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate
 from risaf_link.core.rotation import Floats
 
 Bools = NDArray[np.bool_]
@@ -80,7 +80,7 @@ TINY = 1e-9  # s
 LEAST_WHITE = 0.1  # share of the residuals' variance that is white at least: V is an estimate
 PRIOR = 3.0  # sensors that the prior of the bias walk counts as
 
-MAD_TO_STD = 1.4826 * np.array(
+MAD_FACTORS = MAD_TO_STD * np.array(
     [1.0, 1.0, 1.196, 1.495, 1.363, 1.206, 1.200, 1.140, 1.129, 1.107]
     + [n / (n - 0.8) for n in range(10, 1001)]
 )
@@ -407,6 +407,6 @@ def _median(values: Floats, chosen: Bools) -> Floats:
 
 def _deviation(distance: Floats, chosen: Bools) -> Floats:
     """Robust standard deviation of the chosen of each row, from their distance to the centre."""
-    count = np.minimum(chosen.sum(axis=1, keepdims=True), len(MAD_TO_STD) - 1)
-    deviation: Floats = MAD_TO_STD[count] * _median(distance, chosen)
+    count = np.minimum(chosen.sum(axis=1, keepdims=True), len(MAD_FACTORS) - 1)
+    deviation: Floats = MAD_FACTORS[count] * _median(distance, chosen)
     return deviation
