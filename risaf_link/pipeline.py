@@ -12,17 +12,24 @@ from dataclasses import replace
 import numpy as np
 from msgspec import Struct, field, structs
 
+from risaf_link.core.aiding import Aiding
 from risaf_link.core.array import ArrayCalibration, Calibration
-from risaf_link.core.attitude import FILTERS, AttitudeParameters
+from risaf_link.core.attitude import AttitudeParameters, PaperFilter
+from risaf_link.core.eskf import Eskf
 from risaf_link.core.estimate import ArrayStatus, Estimate
 from risaf_link.core.fusion import FUSIONS, Epoch, Fusion, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
-from risaf_link.core.health import HealthMonitor
-from risaf_link.core.robust import Robust, RobustParameters
+from risaf_link.core.health import ArrayHealth
+from risaf_link.core.robust import Robust
+from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.ingest import GpsParameters, Ingest
+
+FORCE_RESOLUTION = 0.02  # m/s^2; no accelerometer is blamed for less
+HEALTH_PERIOD = 0.1  # s, from one judgement of the sensors to the next
+NO_FORCE = np.full(3, np.nan)
 
 
 class PipelineParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -66,14 +73,20 @@ class Pipeline:
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
         self._clock = VehicleClock()
-        self._fusion = _fusion(p.fusion)
-        self._health = HealthMonitor()
-        self._filter = FILTERS[p.attitude.filter](p.attitude)
+        self._fusion: Fusion = {**FUSIONS, "robust": Robust}[p.fusion.method](p.fusion)
+        self._force_fusion = Robust(structs.replace(p.fusion, resolution=FORCE_RESOLUTION))
+        self._health = self._fusion.health()
+        self._judged = 0.0  # s, when it was made
+        self._filter: Eskf | PaperFilter
+        self._aiding: Aiding | None = None
+        if p.attitude.filter == "eskf":
+            self._filter, self._aiding = Eskf(p.attitude), Aiding(p.attitude)
+        else:
+            self._filter = PaperFilter(p.attitude)
         self._heading = p.heading
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
         self._elapsed = 0.0  # s, of epochs
-        self._unpredicted = 0.0  # s, of epochs without a rate
 
     def step(self, frame: Frame, received_us: int) -> list[Estimate]:
         """Take one frame; the estimates that became possible by it, one an epoch.
@@ -104,10 +117,9 @@ class Pipeline:
         """Carry the estimate on to an epoch."""
         fused = self._fusion.fuse(epoch)
         self._elapsed += epoch.dt
-        self._unpredicted += epoch.dt
-        if not np.isnan(fused.rate_b).any():
-            self._filter.predict(fused, self._unpredicted)
-            self._unpredicted = 0.0
+        self._filter.predict(fused, epoch.dt)
+        if isinstance(self._filter, Eskf) and self._aiding:
+            self._aiding.take(self._filter, fused, self._force(epoch), epoch.dt)
         self._monitor.advance(epoch.dt)
         attitude = self._filter.state(epoch.time_us)
         return Estimate(
@@ -125,6 +137,9 @@ class Pipeline:
         motion = self._finder.take(fix, self._elapsed)
         self._monitor.note_motion(motion)
         heading = motion.heading
+        if isinstance(self._filter, Eskf) and self._aiding:
+            self._filter.set_latitude(fix.latitude)
+            self._aiding.speed.hear(motion.speed, motion.speed_std**2, self._heading.delay)
         if heading is None:
             return
         measured = heading.heading, heading.variance, self._heading.delay + heading.age
@@ -141,8 +156,21 @@ class Pipeline:
             counts["incomplete"],
             counts["samples_lost"],
             len(epoch.rates_b),
-            self._health.watch(epoch),
+            self._judge(len(epoch.rates_b)),
         )
+
+    def _judge(self, sensors: int) -> ArrayHealth:
+        """Standing of the sensors, judged anew now and then."""
+        due = self._elapsed - self._judged >= HEALTH_PERIOD
+        if due or len(self._health.state) != sensors:
+            self._health, self._judged = self._fusion.health(), self._elapsed
+        return self._health
+
+    def _force(self, epoch: Epoch) -> Floats:
+        """Fused specific force, m/s^2; NaN: there is no accelerometer."""
+        if not len(epoch.forces_b):
+            return NO_FORCE
+        return self._force_fusion.fuse_readings(epoch.time_us, epoch.dt, epoch.forces_b).rate_b
 
     def _fits(self, epoch: Epoch) -> bool:
         if self._calibration is None:
@@ -159,9 +187,3 @@ class Pipeline:
             return epoch
         rates_b, forces_b = self._calibration.apply(epoch.rates_b, epoch.forces_b)
         return replace(epoch, rates_b=rates_b, forces_b=forces_b)
-
-
-def _fusion(parameters: FusionParameters) -> Fusion:
-    if parameters.method == "robust":
-        return Robust(RobustParameters())
-    return FUSIONS[parameters.method](parameters)

@@ -21,13 +21,15 @@ from risaf_link.core.rotation import (
 DT = 0.01
 STD = 0.02  # rad, of a heading
 GATE = 3.0
+NOISE, UNKNOWN = np.full(3, 9e-6), np.full(3, np.nan)
 ANGLES = [(0, 0, 0), (0.3, -0.2, 2.0), (-1.0, 1.2, -3.0), (3.0, -0.7, 0.5)]
 
 rates = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
 
 
 def fused(rate_b, variance=1e-6):
-    return FusedRate(0, np.asarray(rate_b, float), np.full(3, variance), np.full(3, 90), 150)
+    rate_b, active = np.asarray(rate_b, float), np.full(3, 90)
+    return FusedRate(0, rate_b, np.full(3, variance), active, 150, NOISE, UNKNOWN)
 
 
 def filter_at(roll=0.0, pitch=0.0, yaw=0.0, bias=(0.0, 0.0, 0.0), **parameters):
@@ -119,10 +121,10 @@ def test_the_covariance_is_carried_on_by_the_derivatives_of_the_step(angles, dt)
     assert estimator._covariance == pytest.approx(expected, rel=1e-6, abs=1e-13)
 
 
-def test_where_the_array_gives_no_variance_the_parameter_does():
-    silent, told = (filter_at(gyro_noise=0.1) for _ in range(2))
+def test_where_the_array_gives_no_variance_the_noise_of_its_sensors_does():
+    silent, told = (filter_at() for _ in range(2))
     silent.predict(fused([0, 0, 0], math.nan), DT)
-    told.predict(fused([0, 0, 0], 0.01), DT)
+    told.predict(fused([0, 0, 0], NOISE[0]), DT)
     assert (silent._covariance == told._covariance).all()
 
 
@@ -184,20 +186,22 @@ def test_a_step_of_a_third_of_a_second_is_a_step_like_any_other():
     assert estimator.state(0).yaw_std < 0.03
 
 
-@pytest.mark.parametrize(
-    ("rate_b", "dt"),
-    [
-        ([0, math.nan, 0], DT),
-        ([0, 0, math.inf], DT),
-        ([0, 0, 0], -DT),
-        ([0, 0, 0], math.nan),
-        ([0, 0, 0], math.inf),
-    ],
-)
-def test_a_step_that_cannot_be_is_refused_and_leaves_the_state_alone(rate_b, dt):
+@pytest.mark.parametrize("unknown", [math.nan, math.inf])
+def test_where_there_is_no_rate_the_next_one_counts_for_the_time(unknown):
     estimator = filter_at(yaw=1.0)
-    with pytest.raises(ValueError, match="expected finite"):
-        estimator.predict(fused(rate_b), dt)
+    for _ in range(5):
+        estimator.predict(fused([0, unknown, 0.5]), DT)
+    assert yaw(estimator) == pytest.approx(1.0)
+    estimator.predict(fused([0, 0, 0.5]), DT)
+    assert yaw(estimator) == pytest.approx(1.0 + 6 * 0.5 * DT, abs=1e-5)
+    assert_sound(estimator)
+
+
+@pytest.mark.parametrize("dt", [-DT, math.nan, math.inf])
+def test_a_step_that_cannot_be_is_refused_and_leaves_the_state_alone(dt):
+    estimator = filter_at(yaw=1.0)
+    with pytest.raises(ValueError, match="expected a finite time"):
+        estimator.predict(fused([0, 0, 0]), dt)
     assert yaw(estimator) == pytest.approx(1.0)
     assert_sound(estimator)
 

@@ -66,7 +66,7 @@ def test_settings_go_over_the_file(tmp_path):
     [
         (
             "fusion: {gaet: 1}",
-            "fusion.gaet: unknown key; known: method, alpha, lower_quantile, upper_quantile",
+            "fusion.gaet: unknown key; known: method, gyro_noise, bias_walk",
         ),
         ("fusion: {alpha: '0.9'}", "fusion.alpha: found '0.9', expected float"),
         ("fusion: {alpha: 1}", "fusion.alpha: found 1, expected float < 1.0"),
@@ -77,7 +77,10 @@ def test_settings_go_over_the_file(tmp_path):
         ("array: {encodings: [GYRO]}", "array.encodings.0: found 'GYRO', expected one of "),
         ("array: {id: 256}", "array.id: found 256, expected int <= 255"),
         ("array: {sensors: 1.5}", "array.sensors: found 1.5, expected int"),
-        ("emit: {ATTITUDE: 5}", "emit.ATTITUDE: unknown key; known: ARRAY_STATUS, ATTITUDE_QUAT"),
+        (
+            "emit: {ATTITUDE: 5}",
+            "emit.ATTITUDE: unknown key; known: ARRAY_SENSOR_HEALTH",
+        ),
         (
             "emit: {ATTITUDE_QUATERNION: 50, ARRAY_STATUS: 0}",
             "emit.ARRAY_STATUS: found 0, expected float > 0.0",

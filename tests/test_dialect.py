@@ -65,6 +65,12 @@ DESIGN = {  # id and size of each message, its fields: type, name, unit
         "uint8_t[30] rejected_percent %, uint8_t[30] state, uint8_t sensor_count, "
         "uint8_t array_id",
     ),
+    "ARRAY_SENSOR_REASON": (
+        59617,
+        132,
+        "uint64_t time_usec us, uint16_t first_sensor, uint8_t[120] reason, "
+        "uint8_t sensor_count, uint8_t array_id",
+    ),
 }
 
 

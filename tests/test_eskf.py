@@ -12,17 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace as set_parameters
 
+from risaf_link.core.aiding import Aiding, SpeedTracker
+from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
-from risaf_link.core.eskf import (
-    ATTITUDE,
-    Aiding,
-    Eskf,
-    EskfParameters,
-    Gravity,
-    Outcome,
-    SpeedTracker,
-)
-from risaf_link.core.fusion import FusedRate
+from risaf_link.core.eskf import ATTITUDE, Eskf, Gravity, Outcome
+from risaf_link.core.fusion import FusedRate, FusionParameters
 from risaf_link.core.rotation import (
     euler_from_quaternion,
     matrix_from_quaternion,
@@ -32,7 +26,8 @@ from risaf_link.core.rotation import (
 
 DATA = Path(os.environ.get("RISAF_DATA", Path(__file__).parents[1] / "../shared/data"))
 RUNS = sorted((DATA / "ekf2_runs").glob("*.npz"))
-DEFAULTS = EskfParameters()
+DEFAULTS = AttitudeParameters()
+SENSORS = FusionParameters()
 UNKNOWN = np.full(3, np.nan)
 DOWN = np.array([0.0, 0.0, GRAVITY])
 DT = 0.01
@@ -40,9 +35,12 @@ GATE = 3.0
 ZURICH = math.radians(47.4)
 
 
-def fused(rate_b, variance=UNKNOWN, sensors=1):
+def fused(rate_b, noise=UNKNOWN, sensors=1, dt=DT):
+    """What a fusion makes of sensors of the default parameters; `noise` where it is told."""
     rate_b = np.asarray(rate_b, dtype=float)
-    return FusedRate(0, rate_b, variance, np.full(3, sensors), sensors)
+    noise = np.where(np.isnan(noise), SENSORS.gyro_noise**2 / dt / sensors, noise)
+    walk = np.full(3, SENSORS.bias_walk / math.sqrt(sensors))
+    return FusedRate(0, rate_b, UNKNOWN, np.full(3, sensors), sensors, noise, walk)
 
 
 def level_filter(parameters=DEFAULTS):
@@ -61,7 +59,7 @@ def aligned_filter(yaw=0.0, std=0.02, parameters=DEFAULTS):
 
 def run(estimator, seconds, rate_b=(0.0, 0.0, 0.0), dt=DT):
     for _ in range(round(seconds / dt)):
-        estimator.predict(fused(rate_b), dt)
+        estimator.predict(fused(rate_b, dt=dt), dt)
 
 
 def degrees_between(p_nb, q_nb):
@@ -163,7 +161,7 @@ def test_an_array_of_many_sensors_wanders_less():
     for sensors in (1, 100):
         estimator = Eskf(known)
         for _ in range(1000):
-            estimator.predict(fused(np.zeros(3), np.full(3, 4e-6), sensors), DT)
+            estimator.predict(fused(np.zeros(3), sensors=sensors), DT)
         tilts.append(estimator.state(0).roll_std)
     assert tilts[0] > 5.0 * tilts[1]
 
@@ -551,9 +549,9 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
         angle = float(np.linalg.norm(rate)) * dt
         half = math.sin(angle / 2) / max(angle, 1e-12) * rate * dt
         truth_nb = truth_nb @ matrix_from_quaternion(np.array([math.cos(angle / 2), *half]))
-        bias = bias + generator.normal(size=3) * p.bias_walk * math.sqrt(dt)
-        noise = generator.normal(size=3) * p.gyro_noise_density / math.sqrt(dt)
-        estimator.predict(fused(rate + bias + noise), dt)
+        bias = bias + generator.normal(size=3) * SENSORS.bias_walk * math.sqrt(dt)
+        noise = generator.normal(size=3) * SENSORS.gyro_noise / math.sqrt(dt)
+        estimator.predict(fused(rate + bias + noise, dt=dt), dt)
         corrections = ()
         wrong_n = np.array([*(lean + 0.3 * generator.normal(size=2)), 0.0])
         gravity_n = estimator.matrix @ truth_nb.T @ (DOWN + wrong_n)
@@ -588,7 +586,7 @@ def honesty():
     parameters = set_parameters(
         DEFAULTS,
         turn_error=0.0,
-        common_noise_density=0.0,
+        common_noise=0.0,
         common_bias_walk=0.0,
         accel_bias_std=0.02,
     )

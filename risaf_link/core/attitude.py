@@ -36,13 +36,33 @@ _I4, _I7 = np.eye(4), np.eye(7)
 
 
 class AttitudeParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """What the attitude filter assumes of the fused rate, as standard deviations."""
+    """What the attitude filters assume of the array and of the world. Defaults: consumer MEMS."""
 
-    filter: Literal["paper"] = "paper"
-    gyro_noise: Annotated[float, Meta(gt=0)] = 0.003  # rad/s a sample, where eq. 8 gives none
-    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6  # rad/s/sqrt(s)
-    initial_bias_std: Annotated[float, Meta(gt=0)] = 0.01  # rad/s
-    initial_tilt_std: Annotated[float, Meta(gt=0)] = 0.05  # rad, roll and pitch
+    filter: Literal["eskf", "paper"] = "eskf"
+    initial_bias_std: Annotated[float, Meta(gt=0)] = 0.01
+    """rad/s: 0.6 deg/s, the zero-rate offset of a good consumer gyro."""
+    initial_tilt_std: Annotated[float, Meta(gt=0)] = 0.05
+    """rad, where no accelerometer tells: a road vehicle stands level within 3 deg."""
+    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6
+    """`paper`: rad/s/sqrt(s), of the fused rate."""
+    common_noise: Annotated[float, Meta(ge=0)] = 2e-5
+    """`eskf`: rad/s/sqrt(Hz), that no averaging takes away: vibration, the board's own motion."""
+    common_bias_walk: Annotated[float, Meta(ge=0)] = 5e-7
+    """`eskf`: rad/s/sqrt(s), of all sensors together: the board's temperature."""
+    turn_error: Annotated[float, Meta(ge=0)] = 2e-3
+    """`eskf`: rad for each sqrt(rad) turned: scale factor and misalignment after calibration."""
+    accel_bias_std: Annotated[float, Meta(gt=0)] = 0.05
+    """`eskf`: m/s^2: 5 mg, of an accelerometer calibrated once; it tilts the apparent vertical by
+    0.3 deg."""
+    gate: Annotated[float, Meta(gt=0)] = 5.0
+    """`eskf`: standard deviations within which gravity and rest are fused."""
+    gravity_distrust: Annotated[float, Meta(gt=0)] = 3.0
+    """`eskf`: s of rejection after which the tilt, not gravity, is held to be wrong."""
+    distrust: Annotated[float, Meta(gt=0)] = 10.0
+    """`eskf`: s of rejection after which yaw, or at rest the bias, is held to be wrong."""
+    reversing: Annotated[float, Meta(gt=0)] = 60.0
+    """`eskf`: s for which a vehicle may drive backwards: a course opposite to yaw is no reason for
+    distrust."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +129,7 @@ class PaperFilter:
         self._bias_walk = np.diag([0.0] * 4 + [p.bias_walk**2] * 3)  # a second
         self._resets = 0
         self._elapsed = 0.0  # s
+        self._waiting = 0.0  # s, for a rate
         self._yaws: deque[tuple[float, float]] = deque(maxlen=YAW_HISTORY)  # without corrections
         self._yaw_corrections = 0.0  # their sum
 
@@ -118,22 +139,27 @@ class PaperFilter:
         Parameters
         ----------
         fused : FusedRate
-            The rate over the time since the state; its variance (eq. 8) is the process noise.
+            The rate over the time since the state; its variance (eq. 8) is the process noise. Where
+            it is not finite on an axis, the state waits for the next one.
         dt : float
             That time, seconds.
 
         Raises
         ------
         ValueError
-            If a rate or the time is not finite, or the time negative.
+            If the time is not finite, or negative.
         """
+        if not 0.0 <= dt < math.inf:
+            raise ValueError(f"dt: found {dt}, expected a finite time, at least 0")
+        dt += self._waiting
         rate = fused.rate_b - self._bias
-        if not (0.0 <= dt < math.inf and np.isfinite(rate).all()):
-            raise ValueError(
-                f"rate {fused.rate_b} over {dt} s: expected finite ones, the time at least 0"
-            )
+        if not np.isfinite(rate).all():
+            self._waiting = dt
+            return
+        self._waiting = 0.0
         self._rate = rate
-        self._integrate(rate, _known(fused.variance, self._parameters.gyro_noise**2), dt)
+        variance = np.where(np.isnan(fused.variance), fused.noise, fused.variance)
+        self._integrate(rate, np.nan_to_num(variance), dt)
         self._elapsed += dt
         self._yaws.append((self._elapsed, yaw_of(self._q) - self._yaw_corrections))
 
@@ -255,13 +281,6 @@ class PaperFilter:
                 return earlier[1] + part * change + self._yaw_corrections
             later = earlier
         return later[1] + self._yaw_corrections if later else yaw_of(self._q)
-
-
-FILTERS: dict[str, type[PaperFilter]] = {"paper": PaperFilter}
-
-
-def _known(variance: Floats, otherwise: float) -> Floats:
-    return np.where(np.isnan(variance), otherwise, variance)
 
 
 def _normalised(q: Floats) -> tuple[Floats, Floats]:

@@ -10,8 +10,6 @@ arXiv:1711.02508, chapter 7: global angular errors). In that frame
   "Intrinsic filtering on Lie groups with applications to attitude estimation", arXiv:1310.2539);
 - a late heading is compared with the attitude of its own time: every correction since then is a
   rotation on the left, which that attitude takes just as well.
-
-`Aiding`, at the end, finds gravity and rest in the array's readings, with the speed that GPS tells.
 """
 
 import math
@@ -19,12 +17,11 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
-from risaf_link.core.attitude import AttitudeState, Innovation
+from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.rotation import Floats, wrap
@@ -39,58 +36,13 @@ HISTORY = 1024  # epochs; a second at 1 kHz
 LONG_STEP = 0.5  # s; over a longer one nothing is known of the rate
 UNKNOWN_RATE = 0.5  # rad/s, standard deviation of what a vehicle may do unseen
 LARGEST_RATE = 1e3  # rad/s; no gyro measures more
+LARGEST_FORCE = 1e4  # m/s^2; no accelerometer measures more
 LARGEST_STEP = 3600.0  # s; afterwards nothing is known anyway
 LARGEST_GAP = 2.5  # s; what is further apart is not one run
 STEEP = 0.99  # sine of the pitch beyond which a heading says nothing of yaw: 82 deg
 
-PART, PARTS = 0.1, 30  # s, and their number in a mean of specific force
-HIDDEN_TIME = 1.0  # s for which one lasts that drives it
-LARGEST_FORCE = 1e4  # m/s^2; no accelerometer measures more
-ACCELERATION_STD = 1.5  # m/s^2, of a vehicle along its way
-ACCELERATION_TIME = 2.0  # s for which it lasts
-SPEED_LOST = 15.0  # m/s, standard deviation beyond which a speed says nothing
-SPEED_JUMP = 1.0  # m/s; a speed that changes by more at once was wrong before
-STANDING_SPEED = 0.5  # m/s; GPS shows half of it where nothing moves
-BLOCK = 0.5  # s, of rest
-STILL, STILL_ALONE, STILL_ON_ROAD = 1.0, 3.0, 6.0  # s: GPS confirms, was never there, is gone
-QUIET = np.array([0.05] * 3 + [0.5] * 3)  # rad/s, m/s^2, standard deviation within a block
-LOOSE = np.array([0.01] * 3 + [0.2] * 3)  # rad/s, m/s^2, between blocks, with GPS
-STRICT = np.array([3e-4] * 3 + [0.01] * 3)  # without
-REST_RATE, UNCONFIRMED_RATE = 1e-4, 1e-3  # rad/s, of a vehicle at rest: wind, people
-
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-
-
-class EskfParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """What the filter assumes of the array and of the world. Defaults: consumer MEMS."""
-
-    gyro_noise_density: Annotated[float, Meta(gt=0)] = 2e-4
-    """rad/s/sqrt(Hz), of one sensor; for an axis whose sensors do not tell (fewer than two)."""
-    common_noise_density: Annotated[float, Meta(ge=0)] = 2e-5
-    """rad/s/sqrt(Hz), that no averaging takes away: vibration, the board's own motion."""
-    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6
-    """rad/s/sqrt(s), of one sensor: 0.02 deg/s in an hour; averages out over the sensors."""
-    common_bias_walk: Annotated[float, Meta(ge=0)] = 5e-7
-    """rad/s/sqrt(s), of all sensors together: the board's temperature."""
-    turn_error: Annotated[float, Meta(ge=0)] = 2e-3
-    """rad for each sqrt(rad) turned: scale factor and misalignment left after calibration."""
-    initial_bias_std: Annotated[float, Meta(gt=0)] = 0.01
-    """rad/s: 0.6 deg/s, the zero-rate offset of a good consumer gyro."""
-    initial_tilt_std: Annotated[float, Meta(gt=0)] = 0.05
-    """rad, where no accelerometer tells: a road vehicle stands level within 3 deg."""
-    accel_bias_std: Annotated[float, Meta(gt=0)] = 0.05
-    """m/s^2: 5 mg, of an accelerometer calibrated once; it tilts the apparent vertical by 0.3
-    deg."""
-    gate: Annotated[float, Meta(gt=0)] = 5.0
-    """Standard deviations within which gravity and rest are fused."""
-    gravity_distrust: Annotated[float, Meta(gt=0)] = 3.0
-    """s of rejection after which the tilt, not gravity, is held to be wrong."""
-    distrust: Annotated[float, Meta(gt=0)] = 10.0
-    """s of rejection after which yaw, or at rest the bias, is held to be wrong."""
-    reversing: Annotated[float, Meta(gt=0)] = 60.0
-    """s for which a vehicle may drive backwards: a course opposite to yaw is no reason for
-    distrust."""
 
 
 class Outcome(IntEnum):
@@ -138,15 +90,16 @@ class Eskf:
 
     Parameters
     ----------
-    parameters : EskfParameters
+    parameters : AttitudeParameters
     """
 
-    def __init__(self, parameters: EskfParameters) -> None:
+    def __init__(self, parameters: AttitudeParameters) -> None:
         p = self._parameters = parameters
         self._by_rate: Quaternion = (1.0, 0.0, 0.0, 0.0)  # the rate's integral alone
         self._correction: Quaternion = (1.0, 0.0, 0.0, 0.0)  # on its left: q_nb is their product
         self._bias = np.zeros(3)
         self._rate = np.zeros(3)
+        self._unseen = np.zeros(3)  # s, each axis, since its rate was known
         self._turned: Vector = (0.0, 0.0, 0.0)  # rotation vector of the last step
         tilt = p.initial_tilt_std**2
         bias = p.initial_bias_std**2
@@ -219,8 +172,8 @@ class Eskf:
         Parameters
         ----------
         fused : FusedRate
-            The rate over the time since the state; its variance and number of sensors make the
-            process noise. On an axis where it is not finite, nothing is known of the rotation.
+            The rate over the time since the state; its noise and bias walk make the process
+            noise. On an axis where it is not finite, the last one holds for a moment.
         dt : float
             That time, seconds. A step that is not positive is no step.
         """
@@ -228,7 +181,9 @@ class Eskf:
             return
         dt = min(dt, LARGEST_STEP)
         known = np.abs(fused.rate_b) < LARGEST_RATE  # false for NaN
-        self._rate = np.where(known, fused.rate_b - self._bias, 0.0)
+        held = np.where(self._unseen < LONG_STEP, self._rate, 0.0)
+        self._rate = np.where(known, fused.rate_b - self._bias, held)
+        unseen = self._see(known, dt)
         before = self._attitude
         self._by_rate = _unit(_product(self._by_rate, _exp(self._rotation(dt))))
         x, y, z = self._earth_rate()
@@ -236,7 +191,7 @@ class Eskf:
         self._elapsed += dt
         self._history.append((self._elapsed, self._by_rate))
         matrix_nb = _matrix(_between(before, self._attitude, 0.5))
-        self._spread(matrix_nb, fused, known.tolist(), dt)
+        self._spread(matrix_nb, fused, unseen, dt)
 
     def correct_heading(
         self, heading: float, variance: float, age: float, gate: float
@@ -381,9 +336,21 @@ class Eskf:
             z + (a * y - b * x) / 12.0,
         )
 
-    def _spread(self, matrix_nb: Floats, fused: FusedRate, known: list[bool], dt: float) -> None:
+    def _see(self, known: NDArray[np.bool_], dt: float) -> Floats:
+        """Variance of what each axis turned unseen in a step, rad^2, (3,).
+
+        A rate that is held stays right for a moment; in `LONG_STEP` it has become any rate.
+        """
+        seen = known & (dt <= LONG_STEP)
+        before, self._unseen = self._unseen, np.where(seen, 0.0, self._unseen + dt)
+        turned = [UNKNOWN_RATE * t * np.minimum(t / LONG_STEP, 1.0) for t in (self._unseen, before)]
+        variance: Floats = np.where(seen, 0.0, turned[0] ** 2 - turned[1] ** 2)
+        self._unseen[known] = 0.0
+        return variance
+
+    def _spread(self, matrix_nb: Floats, fused: FusedRate, unseen: Floats, dt: float) -> None:
         """Carry the covariance on: `angle' = angle - R_nb dt bias`, and the noise of both."""
-        angle, walk = self._noise(fused, known, dt)
+        angle, walk = self._noise(fused, unseen, dt)
         transition = IDENTITY.copy()
         transition[ATTITUDE, BIAS] = matrix_nb * -dt
         covariance = transition @ self._covariance @ transition.T
@@ -393,23 +360,18 @@ class Eskf:
         self._bound()
 
     def _noise(
-        self, fused: FusedRate, known: list[bool], dt: float
+        self, fused: FusedRate, unseen: Floats, dt: float
     ) -> tuple[list[float], list[float]]:
-        """Variances that a step adds to angle (rad^2) and bias ((rad/s)^2), each axis of the body.
-
-        The fused rate's white noise is that of one sensor over their number.
-        """
+        """Variances that a step adds to each axis: of the angle, rad^2, of the bias, (rad/s)^2."""
         p = self._parameters
-        common = p.common_noise_density**2 * dt + p.turn_error**2 * math.hypot(*self._turned)
+        common = p.common_noise**2 * dt + p.turn_error**2 * math.hypot(*self._turned)
         angle, walk = [], []
-        axes = zip(fused.variance.tolist(), fused.active.tolist(), known, strict=True)
-        for variance, active, is_known in axes:
-            sensors = max(active, 1)
-            told = 0.0 <= variance < LARGEST_RATE**2  # false for NaN
-            noise = variance * dt * dt if told else p.gyro_noise_density**2 * dt
-            unknown = 0.0 if is_known and dt <= LONG_STEP else (UNKNOWN_RATE * dt) ** 2
-            angle.append(noise / sensors + common + unknown)
-            walk.append((p.bias_walk**2 / sensors + p.common_bias_walk**2) * dt)
+        axes = zip(fused.noise.tolist(), fused.bias_walk.tolist(), unseen.tolist(), strict=True)
+        for noise, bias_walk, unknown in axes:
+            white = noise * dt * dt if 0.0 <= noise < LARGEST_RATE**2 else 0.0  # false for NaN
+            told = 0.0 <= bias_walk < LARGEST_RATE
+            angle.append(white + common + unknown)
+            walk.append(((bias_walk**2 if told else 0.0) + p.common_bias_walk**2) * dt)
         return angle, walk
 
     def _bound(self) -> None:
@@ -606,279 +568,3 @@ def _matrix(q: Quaternion) -> Floats:
             [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
         ]
     )
-
-
-class SpeedTracker:
-    """Speed and its derivative, from speeds over ground that come late and seldom.
-
-    A Kalman filter of two states; the acceleration forgets itself, a Gauss-Markov process.
-    """
-
-    def __init__(self) -> None:
-        self._since_told = math.inf  # s
-        self._start(0.0, math.inf)
-
-    def _start(self, speed: float, variance: float) -> None:
-        self.speed = speed  # m/s
-        self.acceleration = 0.0  # m/s^2, along the vehicle
-        self.speed_variance = variance
-        self.acceleration_variance = ACCELERATION_STD**2
-        self._common = 0.0  # their covariance
-
-    @property
-    def known(self) -> bool:
-        """Whether a speed was ever told: that of a vehicle."""
-        return self.speed_variance < math.inf
-
-    @property
-    def recent(self) -> bool:
-        """Whether GPS tells the speed."""
-        return self._since_told < LARGEST_GAP
-
-    @property
-    def standing(self) -> bool:
-        """Whether GPS says that the vehicle stands."""
-        return self.recent and self.speed < STANDING_SPEED
-
-    def advance(self, dt: float) -> None:
-        """Let time pass, seconds."""
-        self._since_told += dt
-        keep = math.exp(-dt / ACCELERATION_TIME)
-        self.speed_variance += dt * (2.0 * self._common + dt * self.acceleration_variance)
-        self._common = keep * (self._common + dt * self.acceleration_variance)
-        self.speed += dt * self.acceleration
-        self.acceleration *= keep
-        change = self.acceleration_variance - ACCELERATION_STD**2
-        self.acceleration_variance = ACCELERATION_STD**2 + keep**2 * change
-
-    def hear(self, speed: float, variance: float, age: float) -> None:
-        """Use a speed over ground, m/s, of `age` seconds ago, and its variance."""
-        if not (0 <= speed < 1e3 and 0 < variance < 1e6 and 0 <= age < 10):
-            return
-        self._since_told = 0.0
-        if not self.speed_variance < SPEED_LOST**2:
-            self._start(speed, variance)
-            return
-        by_speed = self.speed_variance - age * self._common
-        by_acceleration = self._common - age * self.acceleration_variance
-        spread = by_speed - age * by_acceleration + variance
-        error = speed - (self.speed - age * self.acceleration)
-        self.speed += by_speed / spread * error
-        self.acceleration += by_acceleration / spread * error
-        self.speed_variance -= by_speed**2 / spread
-        self.acceleration_variance -= by_acceleration**2 / spread
-        self._common -= by_speed * by_acceleration / spread
-
-
-class GravityFinder:
-    """Makes gravity from specific force: means over seconds, and how far they can be believed.
-
-    In a frame that does not turn, the mean specific force is gravity and the mean acceleration
-    (Laidig and Seel, "VQF: highly accurate IMU orientation estimation with bias estimation and
-    magnetic disturbance rejection", arXiv:2203.17024). What shakes a vehicle comes to nothing; the
-    more so the more smoothly the mean begins and ends (a Hann window). Of what lasts, GPS tells
-    what the speed and the rate make (along: its derivative; across: speed times rate). The rest
-    shows itself in two ways: means differ, and the specific force is not of gravity's size,
-    `|f|^2 - g^2 = |a|^2` for a level acceleration.
-    """
-
-    def __init__(self, accel_bias_std: float) -> None:
-        self._bias_std = accel_bias_std
-        self._size = GRAVITY
-        self._doubt = 2.0 * GRAVITY * accel_bias_std  # (m/s^2)^2, of the square of the size
-        self._last: Floats | None = None  # the mean before, m/s^2, NED
-        self._speed = 0.0  # m/s, at the epoch before
-        self._unsteady = 0.0  # (m/s^2)^2, variance of the means, each axis
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget what was measured: the attitude between is not known."""
-        self._parts: deque[Floats] = deque(maxlen=PARTS)  # integrals of force and R_ib, turn, time
-        self._new = 0
-        self._begin()
-
-    def _begin(self) -> None:
-        self._part = np.zeros((3, 4))
-        self._turned = self._time = 0.0
-
-    def take(
-        self, attitude: Eskf, force_b: Floats, dt: float, speed: SpeedTracker
-    ) -> Gravity | None:
-        """Use the specific force of one epoch; the gravity of a window that it completes."""
-        if not (np.abs(force_b) < LARGEST_FORCE).all():
-            return None
-        matrix_ib = attitude.matrix_ib
-        _, rate_y, rate_z = attitude.rate.tolist()
-        if speed.speed_variance < speed.speed**2:
-            gained = speed.speed - self._speed
-            along = gained / dt if abs(gained) < SPEED_JUMP else 0.0
-            force_b = force_b - (along, speed.speed * rate_z, -speed.speed * rate_y)
-        self._speed = speed.speed
-        self._part[:, 0] -= matrix_ib @ force_b * dt
-        self._part[:, 1:] += matrix_ib * dt
-        self._time += dt
-        self._turned += rate_z * dt
-        if self._time < PART:
-            return None
-        self._parts.append(np.array([*self._part.ravel(), self._turned, self._time]))
-        self._new += 1
-        self._begin()
-        if self._last is not None and self._new < PARTS // 2:
-            return None
-        self._new = 0
-        return self._judge(attitude.matrix_ni, speed)
-
-    def learn_size(self, size: float) -> None:
-        """Take note that the vehicle stands: of this size, m/s^2, is gravity, and it is steady."""
-        if abs(size - GRAVITY) < 0.1 * GRAVITY:
-            self._size += 0.2 * (size - self._size)
-            self._doubt = max(0.8 * self._doubt, 0.4 * GRAVITY * self._bias_std)
-        self._unsteady = 0.0
-
-    def _judge(self, matrix_ni: Floats, speed: SpeedTracker) -> Gravity:
-        parts = np.array(self._parts)
-        times = parts[:, 13]
-        weights = np.hanning(len(parts) + 2)[1:-1] * times
-        weights /= weights.sum()
-        integrals = parts[:, :12].reshape(-1, 3, 4)
-        mean_n = matrix_ni @ (weights @ (integrals[:, :, 0] / times[:, np.newaxis]))
-        since = np.cumsum(weights) - weights / 2.0  # share of the mean older than each part
-        lever = matrix_ni @ np.einsum("k,kij->ij", since, integrals[:, :, 1:])
-        span = float(times.sum()) / 2.0  # that the window is worth
-        change = mean_n - (mean_n if self._last is None else self._last)
-        self._last = mean_n
-        now = float(change @ change) / 5.0  # of 3 axes, 1/6 of each in common
-        self._unsteady += 0.2 * (now - self._unsteady)
-        hidden = abs(float(mean_n @ mean_n) - self._size**2)
-        lasting = max(2.0 * HIDDEN_TIME / span, 1.0)
-        along = across = max(hidden - self._doubt, 0.0)
-        if speed.known:
-            turning = float(parts[:, 12] @ parts[:, 12] / (times @ times))
-            along = min(hidden + self._doubt, speed.acceleration_variance)
-            across = min(hidden + self._doubt, turning * speed.speed_variance)
-        known = self._bias_std**2 + max(self._unsteady, now)
-        return Gravity(mean_n, known + lasting * along, known + lasting * across, lever)
-
-
-@dataclass(frozen=True, slots=True)
-class Rest:
-    """The mean rate of a vehicle at rest."""
-
-    rate_b: Floats  # (3,) rad/s
-    variance: Floats  # (3,) (rad/s)^2
-    size: float  # m/s^2, of the specific force; NaN: there is no accelerometer
-    confirmed: bool  # by GPS
-
-
-class RestFinder:
-    """Finds rest in the array's readings, by blocks.
-
-    At rest the readings are a constant and noise. With GPS that says so it is enough that nothing
-    shakes or changes much. Without it a smooth road looks alike: then the noise must be white (the
-    mean square of successive differences is twice the variance), and the means of blocks must agree
-    for long, to what noise allows.
-    """
-
-    def __init__(self) -> None:
-        self._reference: Floats | None = None
-        self._still = 0.0  # s
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin a new block."""
-        self._values: list[Floats] = []
-        self._time = 0.0
-
-    def take(self, rate_b: Floats, force_b: Floats, dt: float, speed: SpeedTracker) -> Rest | None:
-        """Use one epoch; the rest that a block which it completes shows.
-
-        Parameters
-        ----------
-        rate_b, force_b : ndarray, shape (3,)
-            rad/s, bias not taken off, and m/s^2; NaN: no accelerometer.
-        dt : float
-            s.
-        speed : SpeedTracker
-        """
-        self._values.append(np.concatenate((rate_b, force_b)))
-        self._time += dt
-        if self._time < BLOCK or len(self._values) < 5:
-            return None
-        values, time = np.array(self._values), self._time
-        self.restart()
-        with np.errstate(invalid="ignore"):
-            return self._judge(values, time, speed)
-
-    def _judge(self, values: Floats, time: float, speed: SpeedTracker) -> Rest | None:
-        if np.isnan(values[:, 3:]).any():
-            values = values[:, :3]
-        n, axes = values.shape
-        mean, variance = values.mean(axis=0), values.var(axis=0)
-        noise = (np.diff(values, axis=0) ** 2).mean(axis=0) / 2.0
-        standing = speed.standing
-        allowed = (LOOSE if standing else STRICT)[:axes]
-        quiet = (variance < QUIET[:axes] ** 2).all() and np.isfinite(mean).all()
-        if not standing:
-            white = 1.0 - min(4.0 / math.sqrt(n), 0.7)  # the ratio within 4 standard deviations
-            quiet &= bool((variance * white < noise + 1e-9).all()) and not speed.recent
-        reference = self._reference
-        agree = (
-            reference is not None
-            and len(reference) == axes
-            and (np.abs(mean - reference) < allowed + 5.0 * np.sqrt(2.0 * noise / n)).all()
-        )
-        if not (quiet and agree):
-            self._reference, self._still = mean if quiet else None, 0.0
-            return None
-        self._still += time
-        if self._still < (STILL if standing else STILL_ON_ROAD if speed.known else STILL_ALONE):
-            return None
-        floor = REST_RATE if standing else UNCONFIRMED_RATE
-        size = float(np.linalg.norm(mean[3:])) if axes > 3 else math.nan
-        return Rest(mean[:3], np.maximum(noise, variance)[:3] / n + floor**2, size, standing)
-
-
-class Aiding:
-    """Feeds a filter with what the array and the speed tell of gravity and rest.
-
-    Parameters
-    ----------
-    parameters : EskfParameters
-    """
-
-    def __init__(self, parameters: EskfParameters) -> None:
-        self.speed = SpeedTracker()
-        self._gravity = GravityFinder(parameters.accel_bias_std)
-        self._rest = RestFinder()
-
-    def take(
-        self, attitude: Eskf, fused: FusedRate, force_b: Floats, dt: float
-    ) -> tuple[Correction, ...]:
-        """Correct the attitude after a predict, where there is something to correct it by.
-
-        Parameters
-        ----------
-        attitude : Eskf
-        fused : FusedRate
-        force_b : ndarray, shape (3,)
-            Specific force, m/s^2; NaN: there is no accelerometer.
-        dt : float
-            Seconds since the epoch before.
-        """
-        if not dt > 0:
-            return ()
-        self.speed.advance(min(dt, LARGEST_STEP))
-        if dt > LONG_STEP or not np.isfinite(fused.rate_b).all():
-            self._gravity.restart()
-            self._rest.restart()
-            return ()
-        corrections: tuple[Correction, ...] = ()
-        rest = self._rest.take(fused.rate_b, force_b, dt, self.speed)
-        if rest is not None:
-            corrections += attitude.correct_zero_rate(rest.rate_b, rest.variance, rest.confirmed)
-            if corrections[0].fused:
-                self._gravity.learn_size(rest.size)
-        gravity = self._gravity.take(attitude, force_b, dt, self.speed)
-        if gravity is not None:
-            corrections += attitude.correct_gravity(gravity)
-        return corrections

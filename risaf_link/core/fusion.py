@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from risaf_link.core.health import ArrayHealth, SilenceMonitor
 from risaf_link.core.rotation import Floats
 
 MAD_TO_STD = 1.4826
@@ -25,9 +26,27 @@ Croux, "Alternatives to the Median Absolute Deviation", JASA 88, 1993."""
 class FusionParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """How the sensors of an array become one rate."""
 
-    method: Literal["risaf", "robust", "median", "mean"] = "risaf"
-    alpha: Annotated[float, Meta(ge=0, lt=1)] = 0.995  # eq. 5, an epoch
-    lower_quantile: Annotated[float, Meta(ge=0, le=0.5)] = 0.20  # eq. 6
+    method: Literal["robust", "risaf", "median", "mean"] = "robust"
+    gyro_noise: Annotated[float, Meta(gt=0)] = 2e-4
+    """rad/s/sqrt(Hz), of one sensor; where fewer than two are behind a rate and none can tell."""
+    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6
+    """rad/s/sqrt(s), of one sensor: 0.02 deg/s in an hour. `robust` goes by what it sees of it the
+    more, the more sensors there are."""
+    gate: Annotated[float, Meta(ge=2)] = 4.0
+    """`robust`: standard deviations from the rest beyond which a reading is rejected, and a
+    residual is an alarm. Of Gaussian readings one in 16000; a smaller gate costs good sensors."""
+    bias_time: Annotated[float, Meta(ge=5)] = 100.0
+    """`robust`: s in which relative biases are learnt. Long against bursts, of which the undetected
+    part is absorbed in inverse proportion; short against the hours of ageing and temperature."""
+    hold_time: Annotated[float, Meta(ge=0)] = 5.0
+    """`robust`: s without an alarm that make a sensor trusted: some decay times of a burst's tail.
+    A longer one costs the sensors that are hit often: at 20 s most never come back."""
+    resolution: Annotated[float, Meta(ge=0)] = 3e-4
+    """`robust`: rad/s; no sensor is blamed for less: several counts' worth of rounding."""
+    alpha: Annotated[float, Meta(ge=0, lt=1)] = 0.995
+    """`risaf`, eq. 5: memory of a relative bias, an epoch."""
+    lower_quantile: Annotated[float, Meta(ge=0, le=0.5)] = 0.20
+    """`risaf`, eq. 6."""
     upper_quantile: Annotated[float, Meta(ge=0.5, le=1)] = 0.80
 
 
@@ -48,9 +67,11 @@ class FusedRate:
 
     time_us: int
     rate_b: Floats  # (3,) rad/s; NaN on an axis without a valid reading
-    variance: Floats  # (3,) (rad/s)^2, of one sensor among those behind the rate; NaN below two
+    variance: Floats  # (3,) (rad/s)^2, eq. 8: of one sensor among those behind it; NaN below two
     active: NDArray[np.int64]  # (3,) sensors behind the rate
     valid: int  # sensors with a valid reading on all axes
+    noise: Floats  # (3,) (rad/s)^2, of the rate itself: its white part; NaN: not known
+    bias_walk: Floats  # (3,) rad/s/sqrt(s), of the rate's bias; NaN: not known
 
 
 class Fusion(Protocol):
@@ -58,6 +79,10 @@ class Fusion(Protocol):
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
+        ...
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch."""
         ...
 
 
@@ -75,6 +100,7 @@ class Risaf:
 
     def __init__(self, parameters: FusionParameters) -> None:
         self._parameters = parameters
+        self._silence = SilenceMonitor()
         self._relative_bias = np.zeros((3, 0))
 
     @property
@@ -86,6 +112,7 @@ class Risaf:
         """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
         p = self._parameters
         rates, valid = _channels(epoch)
+        self._silence.watch(epoch.rates_b, epoch.dt)
         self._resize(rates.shape[1])
         mean = rates.sum(axis=1, where=valid) / np.maximum(valid.sum(axis=1), 1)
         residual = rates - mean[:, None]
@@ -96,7 +123,11 @@ class Risaf:
         active = (lower[:, None] <= corrected) & (corrected <= upper[:, None])  # eq. 6
         if not active.any(axis=1).all():
             active |= valid & ~active.any(axis=1, keepdims=True)
-        return _mean_of_active(epoch, corrected, active, valid)  # eq. 7 and 8
+        return _mean_of_active(p, epoch, corrected, active, valid)  # eq. 7 and 8
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return self._silence.health(self.relative_bias)
 
     def _resize(self, n: int) -> None:
         """Forget the last sensors, or add some without a bias, if their number has changed."""
@@ -106,32 +137,44 @@ class Risaf:
             self._relative_bias = np.hstack([self._relative_bias[:, :n], new])
 
 
-@dataclass
 class Mean:
     """The plain mean of the valid readings, per axis."""
 
-    parameters: FusionParameters
+    def __init__(self, parameters: FusionParameters) -> None:
+        self._parameters = parameters
+        self._silence = SilenceMonitor()
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
         rates, valid = _channels(epoch)
-        return _mean_of_active(epoch, rates, valid, valid)
+        self._silence.watch(epoch.rates_b, epoch.dt)
+        return _mean_of_active(self._parameters, epoch, rates, valid, valid)
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return self._silence.health()
 
 
-@dataclass
 class Median:
     """The median of the valid readings, per axis."""
 
-    parameters: FusionParameters
+    def __init__(self, parameters: FusionParameters) -> None:
+        self._parameters = parameters
+        self._silence = SilenceMonitor()
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
         rates, valid = _channels(epoch)
+        self._silence.watch(epoch.rates_b, epoch.dt)
         (median,) = quantiles(rates, (0.5,))
         (deviation,) = quantiles(np.abs(rates - median[:, None]), (0.5,))
         count = valid.sum(axis=1)
         variance = np.where(count > 1, (MAD_TO_STD * deviation) ** 2, np.nan)
-        return FusedRate(epoch.time_us, median, variance, count, _whole(valid))
+        return _fused(self._parameters, epoch, median, variance, count, valid)
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return self._silence.health()
 
 
 FUSIONS: dict[str, type[Risaf | Mean | Median]] = {"risaf": Risaf, "mean": Mean, "median": Median}
@@ -177,20 +220,41 @@ def _channels(epoch: Epoch) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _mean_of_active(
-    epoch: Epoch, rates: Floats, active: NDArray[np.bool_], valid: NDArray[np.bool_]
+    parameters: FusionParameters,
+    epoch: Epoch,
+    rates: Floats,
+    active: NDArray[np.bool_],
+    valid: NDArray[np.bool_],
 ) -> FusedRate:
     """Mean and sample variance of the active channels of each axis: eq. 7 and 8."""
     count = active.sum(axis=1)
     rate = rates.sum(axis=1, where=active) / _or_nan(count)
     square = ((rates - rate[:, None]) ** 2).sum(axis=1, where=active)
-    return FusedRate(epoch.time_us, rate, square / _or_nan(count - 1), count, _whole(valid))
+    return _fused(parameters, epoch, rate, square / _or_nan(count - 1), count, valid)
+
+
+def _fused(
+    parameters: FusionParameters,
+    epoch: Epoch,
+    rate: Floats,
+    variance: Floats,
+    count: NDArray[np.int64],
+    valid: NDArray[np.bool_],
+) -> FusedRate:
+    """A rate with its noise and bias walk, as if its sensors were independent and Gaussian."""
+    sensors = _or_nan(count)
+    one = parameters.gyro_noise**2 / epoch.dt if epoch.dt > 0 else np.nan
+    return FusedRate(
+        epoch.time_us,
+        rate,
+        variance,
+        count,
+        int(valid.all(axis=0).sum()),
+        np.where(np.isnan(variance), one, variance) / sensors,
+        parameters.bias_walk / np.sqrt(sensors),
+    )
 
 
 def _or_nan(count: NDArray[np.int64]) -> Floats:
     """A divisor that gives NaN, silently, where there is nothing to divide by."""
     return np.where(count > 0, count, np.nan)
-
-
-def _whole(valid: NDArray[np.bool_]) -> int:
-    """How many sensors are valid on all axes."""
-    return int(valid.all(axis=0).sum())

@@ -77,6 +77,7 @@ class Motion:
 
     speed: float  # m/s over ground, NaN: not known
     heading: Heading | None  # None: too slow, or nothing to make it from
+    speed_std: float = UNKNOWN_SPEED_STD  # m/s
 
 
 class HeadingFinder:
@@ -107,13 +108,16 @@ class HeadingFinder:
         source = self._parameters.source
         track = self._track(fix, time_s)
         speed = fix.speed if math.isfinite(fix.speed) else track.speed
+        speed_std = _known(fix.speed_std, track.speed_std)
         if source in {"auto", "dual_antenna"} and math.isfinite(fix.yaw):
-            return Motion(speed, self._heading(fix.yaw, fix.course_std, HeadingSource.DUAL_ANTENNA))
+            return Motion(
+                speed, self._heading(fix.yaw, fix.course_std, HeadingSource.DUAL_ANTENNA), speed_std
+            )
         if source == "dual_antenna":
-            return Motion(speed, None)
+            return Motion(speed, None, speed_std)
         by_velocity = math.isfinite(fix.course) and math.isfinite(fix.speed)
         if source == "velocity" or (source == "auto" and by_velocity):
-            return Motion(speed, self._from_velocity(fix) if by_velocity else None)
+            return Motion(speed, self._from_velocity(fix) if by_velocity else None, speed_std)
         return track
 
     def _from_velocity(self, fix: GpsFix) -> Heading | None:

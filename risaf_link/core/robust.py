@@ -1,4 +1,4 @@
-"""Epoch -> RobustRate: one angular rate from an array of which up to 40 % may fail, in any way.
+"""Epoch -> FusedRate: one angular rate from an array of which up to 40 % may fail, in any way.
 
 Why not eq. 5 to 8
 ------------------
@@ -24,8 +24,8 @@ A channel is on the jury if it is valid and trusted; r_i is its reading less its
 3. Watch. z_i, the residuals inside low-passed, shows what no single reading does: a burst's tail, a
    step, a drift, a scale. Alarms are |z_i - median z| beyond gate times the scaled median absolute
    deviation of all z; more than `BURST` of the readings of a second rejected; a reading that does
-   not change; silence. The median and deviation are those of all channels that change, trusted or
-   not: however many are out, the bar does not close in on the rest.
+   not change while most others do; silence. The median and deviation are those of all channels that
+   change, trusted or not: however many are out, the bar does not close in on the rest.
 4. Trust. A channel is trusted once it has been `hold_time` without an alarm. One that has not been
    trusted for `RELEARN` is taken to have changed for good, and learns its bias anew, as a new one
    does: from all of its readings, without a say in the rate.
@@ -37,7 +37,7 @@ silence or a reading that does not change.
 
 How certain the rate is
 -----------------------
-`variance` is that of the white part, a sample: (s^2 - V) / (active). s^2 is the mean over
+`noise` is the variance of its white part, a sample: (s^2 - V) / (active). s^2 is the mean over
 `NOISE_TIME` of the active residuals' sample variance (at 4 standard deviations, truncation takes
 0.1 % off it), V the mean square of their z: what relative biases are not learnt yet spreads the
 residuals, but hardly changes from one epoch to the next.
@@ -45,7 +45,7 @@ residuals, but hardly changes from one epoch to the next.
 by q, then V = q^2 T^2 / (2 (T + S)) + s^2 dt T / (2 S (T + S)), S the time constant of z, T at
 first two thirds of the time since the start; solved for q it gives q / sqrt(active). Each of c
 channels that have come or gone since the last epoch has moved the rate by about sqrt(V) / (active):
-c V / (active)^2 / dt is added to the square. A filter adds `variance * dt**2` to the angles'
+c V / (active)^2 / dt is added to the square. A filter adds `noise * dt**2` to the angles'
 covariance and `bias_walk**2 * dt` to that of the bias of the rate.
 What all sensors have in common (the mean's bias at the start, its temperature, vibration rectified
 alike) no residual shows: the filter has to add what it knows of that.
@@ -53,14 +53,12 @@ alike) no residual shows: the filter has to add what it knows of that.
 
 import math
 from dataclasses import dataclass, fields
-from enum import IntEnum
-from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate
+from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate, FusionParameters
+from risaf_link.core.health import SILENT_AFTER, ArrayHealth, Reason, SensorState
 from risaf_link.core.rotation import Floats
 
 Bools = NDArray[np.bool_]
@@ -73,7 +71,6 @@ SWELL = 3.0  # times the spread of late: what the spread of an epoch may be, if 
 NOISE_TIME = 2.0  # s, of averaging the noise: vibration comes and goes in seconds
 SPREAD_TIME = 30.0  # s, of averaging the spread of z: ten times its low pass
 FROZEN_AFTER = 0.5  # s; at a noise of one count, 50 equal readings have a chance of 1e-27
-SILENT_AFTER = 1.0  # s
 RELEARN = 30.0  # s; bursts are over by then
 DEAD_AFTER = 60.0  # s without trust: it did not come back when it had learnt anew
 TINY = 1e-9  # s
@@ -89,59 +86,6 @@ deviation. Croux and Rousseeuw, "Time-Efficient Algorithms for Two Highly Robust
 Scale", 1992."""
 
 
-class RobustParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """What is known beforehand of an array; the defaults are for gyros, in rad/s.
-
-    Attributes
-    ----------
-    gate : float
-        Robust standard deviations from the rest beyond which a reading is rejected, and a residual
-        is an alarm. 4: of Gaussian readings one in 16000; a smaller one costs good sensors.
-    bias_time : float
-        T, s, in which relative biases are learnt. Long against bursts, of which the undetected part
-        is absorbed in proportion to 1 / T; short against the hours of ageing and temperature.
-    hold_time : float
-        Seconds without an alarm that make a sensor trusted: some decay times of a burst's tail. A
-        longer one costs the sensors that are hit often: at 20 s most never come back.
-    resolution : float
-        No sensor is blamed for less; several counts' worth of rounding.
-    bias_walk : float
-        Of one sensor, per sqrt(s): prior, for small arrays.
-    """
-
-    gate: Annotated[float, Meta(ge=2)] = 4.0
-    bias_time: Annotated[float, Meta(ge=5)] = 100.0
-    hold_time: Annotated[float, Meta(ge=0)] = 5.0
-    resolution: Annotated[float, Meta(ge=0)] = 3e-4
-    bias_walk: Annotated[float, Meta(ge=0)] = 5e-5
-
-
-class SensorState(IntEnum):
-    """A sensor's standing, as RISAF_SENSOR_STATE."""
-
-    HEALTHY = 0
-    SUSPECT = 1
-    DEAD = 2
-
-
-class Reason(IntEnum):
-    """Why a sensor is not healthy; of several, the greatest is told."""
-
-    NONE = 0
-    SETTLING = 1  # new, or back: not long enough without an alarm
-    WANDERING = 2  # its bias has left the others': a step, a drift, a scale
-    OUTLYING = 3  # too many of its readings are rejected
-    FROZEN = 4  # its reading does not change; so does one at the end of its range
-    SILENT = 5  # no valid reading
-
-
-@dataclass(frozen=True, slots=True)
-class RobustRate(FusedRate):
-    """The array as one gyro; `variance` is that of the rate's white part."""
-
-    bias_walk: Floats  # (3,) rad/s/sqrt(s): wander of the rate's bias
-
-
 @dataclass(slots=True)
 class Channels:
     """What is remembered of each channel, shape (3, n); times in s."""
@@ -152,6 +96,7 @@ class Channels:
     slow: Floats  # z: low-passed residual, rad/s
     rejected: Floats  # share of its readings, of about a second
     unchanged: Floats  # for how long the reading has been
+    frozen: Floats  # 1: it does not, and most others do
     silent: Floats  # for how long
     calm: Floats  # since the last alarm
     out: Floats  # since it was last trusted
@@ -178,10 +123,10 @@ class Robust:
 
     Parameters
     ----------
-    parameters : RobustParameters
+    parameters : FusionParameters
     """
 
-    def __init__(self, parameters: RobustParameters) -> None:
+    def __init__(self, parameters: FusionParameters) -> None:
         self._parameters = parameters
         self._channels = Channels.new(0)
         self._trusted: Bools = np.zeros((3, 0), dtype=bool)
@@ -195,40 +140,27 @@ class Robust:
         """Relative bias of each sensor, shape (n, 3), rad/s."""
         return self._channels.bias.T.copy()
 
-    @property
-    def rejected(self) -> Floats:
-        """Share of each sensor's readings rejected in the last second, its worst axis, (n,)."""
-        worst: Floats = self._channels.rejected.max(axis=0)
-        return worst
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch; of a sensor, its worst axis counts.
 
-    @property
-    def reason(self) -> NDArray[np.int8]:
-        """`Reason` of each sensor, its worst axis, shape (n,)."""
+        Dead: frozen, or for a second silent, or for a minute not trusted.
+        """
         c = self._channels
         reason = np.where(self._trusted, Reason.NONE, Reason.SETTLING).astype(np.int8)
         reason[c.wandering > 0] = Reason.WANDERING
         reason[c.rejected > BURST] = Reason.OUTLYING
-        reason[c.unchanged > FROZEN_AFTER] = Reason.FROZEN
+        reason[c.frozen > 0] = Reason.FROZEN
         reason[c.silent > 0] = Reason.SILENT
-        worst: NDArray[np.int8] = reason.max(axis=0)
-        return worst
+        worst = reason.max(axis=0)
+        dead = (c.frozen > 0) | (c.silent > SILENT_AFTER) | (c.out > DEAD_AFTER)
+        state = np.where(dead.any(axis=0), SensorState.DEAD, worst > Reason.NONE).astype(np.int8)
+        return ArrayHealth(state, worst, c.rejected.max(axis=0), self.relative_bias)
 
-    @property
-    def state(self) -> NDArray[np.int8]:
-        """`SensorState` of each sensor, shape (n,).
-
-        Dead: unchanged, or for a second silent, or for a minute not trusted.
-        """
-        c = self._channels
-        dead = (c.unchanged > FROZEN_AFTER) | (c.silent > SILENT_AFTER) | (c.out > DEAD_AFTER)
-        suspect = self.reason > Reason.NONE
-        return np.where(dead.any(axis=0), SensorState.DEAD, suspect).astype(np.int8)
-
-    def fuse(self, epoch: Epoch) -> RobustRate:
+    def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
         return self.fuse_readings(epoch.time_us, epoch.dt, epoch.rates_b)
 
-    def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> RobustRate:
+    def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> FusedRate:
         """Fuse what sensors of one kind read at one instant.
 
         Parameters
@@ -268,24 +200,33 @@ class Robust:
         known = np.where(count > 0, count, np.nan)
         slow = self._slow_square(active, known)
         white = np.maximum(self._noise - slow, LEAST_WHITE * self._noise)
-        return RobustRate(
+        return FusedRate(
             time_us,
             centre[:, 0] + mean + 0.0 * known,
-            white / known,
+            self._noise + 0.0 * known,
             count,
             int(valid.all(axis=0).sum()),
+            np.where(np.isnan(white), self._noise_alone(dt), white) / known,
             self._bias_walk(white, slow, known, moved, dt),
         )
 
     def _note_changes(self, readings: Floats, valid: Bools, dt: float) -> Bools:
-        """Which channels are valid and have changed of late."""
+        """Which channels are valid and not frozen.
+
+        Frozen is what does not change while most others of its axis do: a vehicle at rest and
+        coarse counts look alike to all.
+        """
         c = self._channels
         c.unchanged += dt
         c.unchanged *= readings == c.reading
         c.silent += dt
         c.silent *= ~valid
         c.reading = readings
-        return valid & (c.unchanged <= FROZEN_AFTER)
+        still = valid & (c.unchanged > FROZEN_AFTER)
+        most = 2 * still.sum(axis=1) <= valid.sum(axis=1)
+        c.frozen[:] = still & most[:, None]
+        changing: Bools = valid & (c.frozen == 0.0)
+        return changing
 
     def _limit(self, distance: Floats, jury: Bools, dt: float) -> Floats:
         """How far from the centre of the jury a reading is inside; shape (3, 1)."""
@@ -299,6 +240,10 @@ class Robust:
         widest = np.maximum(np.maximum(spread, self._spread), p.resolution)
         limit: Floats = np.maximum(p.gate * widest, nearest)
         return limit
+
+    def _noise_alone(self, dt: float) -> float:
+        """Variance of the reading of a sensor that is alone, as the parameters have it."""
+        return self._parameters.gyro_noise**2 / dt if dt > 0 else math.nan
 
     def _average_noise(self, residual: Floats, count: NDArray[np.int64], dt: float) -> None:
         square = np.einsum("ij,ij->i", residual, residual) / np.maximum(count - 1, 1)
@@ -334,7 +279,7 @@ class Robust:
         c = self._channels
         alarm = c.rejected > BURST
         alarm |= c.wandering > 0.0
-        alarm |= c.unchanged > FROZEN_AFTER
+        alarm |= c.frozen > 0.0
         alarm |= c.silent > SILENT_AFTER
         c.calm += dt
         c.calm *= ~alarm
@@ -364,7 +309,8 @@ class Robust:
         time = min(max(2 / 3 * self._elapsed, WATCH_TIME), p.bias_time)
         noise = np.where(np.isnan(white), 0.0, white)
         walk = 2 * (time + WATCH_TIME) / time**2 * slow - dt / (WATCH_TIME * time) * noise
-        walk = (PRIOR * p.bias_walk**2 + count * np.maximum(walk, 0.0)) / (PRIOR + count)
+        told = count - 1  # one sensor has no residual
+        walk = (PRIOR * p.bias_walk**2 + told * np.maximum(walk, 0.0)) / (PRIOR + told)
         if dt > 0 and moved.any():
             walk += moved / (count * dt) * slow
         density: Floats = np.sqrt(walk / count)

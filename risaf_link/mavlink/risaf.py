@@ -404,6 +404,24 @@ enums["RISAF_SENSOR_STATE"][2] = EnumEntry("RISAF_SENSOR_STATE_DEAD", """Silent 
 RISAF_SENSOR_STATE_ENUM_END = 3
 enums["RISAF_SENSOR_STATE"][3] = EnumEntry("RISAF_SENSOR_STATE_ENUM_END", """""")
 
+# RISAF_SENSOR_REASON
+enums["RISAF_SENSOR_REASON"] = Enum()
+enums["RISAF_SENSOR_REASON"].bitmask = False
+RISAF_SENSOR_REASON_NONE = 0
+enums["RISAF_SENSOR_REASON"][0] = EnumEntry("RISAF_SENSOR_REASON_NONE", """It is healthy.""")
+RISAF_SENSOR_REASON_SETTLING = 1
+enums["RISAF_SENSOR_REASON"][1] = EnumEntry("RISAF_SENSOR_REASON_SETTLING", """New, or back: not long enough without an alarm.""")
+RISAF_SENSOR_REASON_WANDERING = 2
+enums["RISAF_SENSOR_REASON"][2] = EnumEntry("RISAF_SENSOR_REASON_WANDERING", """Its bias has left the others': a step, a drift, a scale.""")
+RISAF_SENSOR_REASON_OUTLYING = 3
+enums["RISAF_SENSOR_REASON"][3] = EnumEntry("RISAF_SENSOR_REASON_OUTLYING", """Too many of its readings are rejected.""")
+RISAF_SENSOR_REASON_FROZEN = 4
+enums["RISAF_SENSOR_REASON"][4] = EnumEntry("RISAF_SENSOR_REASON_FROZEN", """Its reading does not change, or stays at the end of its range.""")
+RISAF_SENSOR_REASON_SILENT = 5
+enums["RISAF_SENSOR_REASON"][5] = EnumEntry("RISAF_SENSOR_REASON_SILENT", """It has no valid reading.""")
+RISAF_SENSOR_REASON_ENUM_END = 6
+enums["RISAF_SENSOR_REASON"][6] = EnumEntry("RISAF_SENSOR_REASON_ENUM_END", """""")
+
 # message IDs
 MAVLINK_MSG_ID_BAD_DATA = -1
 MAVLINK_MSG_ID_UNKNOWN = -2
@@ -414,6 +432,7 @@ MAVLINK_MSG_ID_TEMPERATURE_ARRAY = 59613
 MAVLINK_MSG_ID_GPS_HEADING_STATUS = 59614
 MAVLINK_MSG_ID_ARRAY_STATUS = 59615
 MAVLINK_MSG_ID_ARRAY_SENSOR_HEALTH = 59616
+MAVLINK_MSG_ID_ARRAY_SENSOR_REASON = 59617
 
 
 class MAVLink_imu_array_info_message(MAVLink_message):
@@ -741,6 +760,49 @@ class MAVLink_array_sensor_health_message(MAVLink_message):
 setattr(MAVLink_array_sensor_health_message, "name", mavlink_msg_deprecated_name_property())
 
 
+class MAVLink_array_sensor_reason_message(MAVLink_message):
+    """
+    Why sensors are not healthy, of up to 120. Sent slowly, round
+    robin.
+    """
+
+    id = MAVLINK_MSG_ID_ARRAY_SENSOR_REASON
+    msgname = "ARRAY_SENSOR_REASON"
+    fieldnames = ["time_usec", "first_sensor", "reason", "sensor_count", "array_id"]
+    ordered_fieldnames = ["time_usec", "first_sensor", "reason", "sensor_count", "array_id"]
+    fieldtypes = ["uint64_t", "uint16_t", "uint8_t", "uint8_t", "uint8_t"]
+    fielddisplays_by_name: Dict[str, str] = {}
+    fieldenums_by_name: Dict[str, str] = {"reason": "RISAF_SENSOR_REASON"}
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us"}
+    native_format = bytearray(b"<QHBBB")
+    orders = [0, 1, 2, 3, 4]
+    lengths = [1, 1, 120, 1, 1]
+    array_lengths = [0, 0, 120, 0, 0]
+    crc_extra = 234
+    unpacker = struct.Struct("<QH120BBB")
+    instance_field = None
+    instance_offset = -1
+
+    def __init__(self, time_usec: int, first_sensor: int, reason: Sequence[int], sensor_count: int, array_id: int):
+        MAVLink_message.__init__(self, MAVLink_array_sensor_reason_message.id, MAVLink_array_sensor_reason_message.msgname)
+        self._fieldnames = MAVLink_array_sensor_reason_message.fieldnames
+        self._instance_field = MAVLink_array_sensor_reason_message.instance_field
+        self._instance_offset = MAVLink_array_sensor_reason_message.instance_offset
+        self.time_usec = time_usec
+        self.first_sensor = first_sensor
+        self.reason = reason
+        self.sensor_count = sensor_count
+        self.array_id = array_id
+
+    def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.first_sensor, self.reason[0], self.reason[1], self.reason[2], self.reason[3], self.reason[4], self.reason[5], self.reason[6], self.reason[7], self.reason[8], self.reason[9], self.reason[10], self.reason[11], self.reason[12], self.reason[13], self.reason[14], self.reason[15], self.reason[16], self.reason[17], self.reason[18], self.reason[19], self.reason[20], self.reason[21], self.reason[22], self.reason[23], self.reason[24], self.reason[25], self.reason[26], self.reason[27], self.reason[28], self.reason[29], self.reason[30], self.reason[31], self.reason[32], self.reason[33], self.reason[34], self.reason[35], self.reason[36], self.reason[37], self.reason[38], self.reason[39], self.reason[40], self.reason[41], self.reason[42], self.reason[43], self.reason[44], self.reason[45], self.reason[46], self.reason[47], self.reason[48], self.reason[49], self.reason[50], self.reason[51], self.reason[52], self.reason[53], self.reason[54], self.reason[55], self.reason[56], self.reason[57], self.reason[58], self.reason[59], self.reason[60], self.reason[61], self.reason[62], self.reason[63], self.reason[64], self.reason[65], self.reason[66], self.reason[67], self.reason[68], self.reason[69], self.reason[70], self.reason[71], self.reason[72], self.reason[73], self.reason[74], self.reason[75], self.reason[76], self.reason[77], self.reason[78], self.reason[79], self.reason[80], self.reason[81], self.reason[82], self.reason[83], self.reason[84], self.reason[85], self.reason[86], self.reason[87], self.reason[88], self.reason[89], self.reason[90], self.reason[91], self.reason[92], self.reason[93], self.reason[94], self.reason[95], self.reason[96], self.reason[97], self.reason[98], self.reason[99], self.reason[100], self.reason[101], self.reason[102], self.reason[103], self.reason[104], self.reason[105], self.reason[106], self.reason[107], self.reason[108], self.reason[109], self.reason[110], self.reason[111], self.reason[112], self.reason[113], self.reason[114], self.reason[115], self.reason[116], self.reason[117], self.reason[118], self.reason[119], self.sensor_count, self.array_id), force_mavlink1=force_mavlink1)
+
+
+# Define name on the class for backwards compatibility (it is now msgname).
+# Done with setattr to hide the class variable from mypy.
+setattr(MAVLink_array_sensor_reason_message, "name", mavlink_msg_deprecated_name_property())
+
+
 mavlink_map: Dict[int, Type[MAVLink_message]] = {
     MAVLINK_MSG_ID_IMU_ARRAY_INFO: MAVLink_imu_array_info_message,
     MAVLINK_MSG_ID_GYRO_ARRAY: MAVLink_gyro_array_message,
@@ -749,6 +811,7 @@ mavlink_map: Dict[int, Type[MAVLink_message]] = {
     MAVLINK_MSG_ID_GPS_HEADING_STATUS: MAVLink_gps_heading_status_message,
     MAVLINK_MSG_ID_ARRAY_STATUS: MAVLink_array_status_message,
     MAVLINK_MSG_ID_ARRAY_SENSOR_HEALTH: MAVLink_array_sensor_health_message,
+    MAVLINK_MSG_ID_ARRAY_SENSOR_REASON: MAVLink_array_sensor_reason_message,
 }
 
 
@@ -1384,3 +1447,29 @@ class MAVLink(object):
 
         """
         self.send(self.array_sensor_health_encode(time_usec, first_sensor, relative_bias, rejected_percent, state, sensor_count, array_id), force_mavlink1=force_mavlink1)
+
+    def array_sensor_reason_encode(self, time_usec: int, first_sensor: int, reason: Sequence[int], sensor_count: int, array_id: int) -> MAVLink_array_sensor_reason_message:
+        """
+        Why sensors are not healthy, of up to 120. Sent slowly, round robin.
+
+        time_usec                 : Time of the epoch since boot. [us] (type:uint64_t)
+        first_sensor              : Index of the first sensor in this message. (type:uint16_t)
+        reason                    : Reason of each sensor. (type:uint8_t, values:RISAF_SENSOR_REASON)
+        sensor_count              : Number of sensors in this message. (type:uint8_t)
+        array_id                  : Which array of the vehicle. (type:uint8_t)
+
+        """
+        return MAVLink_array_sensor_reason_message(time_usec, first_sensor, reason, sensor_count, array_id)
+
+    def array_sensor_reason_send(self, time_usec: int, first_sensor: int, reason: Sequence[int], sensor_count: int, array_id: int, force_mavlink1: bool = False) -> None:
+        """
+        Why sensors are not healthy, of up to 120. Sent slowly, round robin.
+
+        time_usec                 : Time of the epoch since boot. [us] (type:uint64_t)
+        first_sensor              : Index of the first sensor in this message. (type:uint16_t)
+        reason                    : Reason of each sensor. (type:uint8_t, values:RISAF_SENSOR_REASON)
+        sensor_count              : Number of sensors in this message. (type:uint8_t)
+        array_id                  : Which array of the vehicle. (type:uint8_t)
+
+        """
+        self.send(self.array_sensor_reason_encode(time_usec, first_sensor, reason, sensor_count, array_id), force_mavlink1=force_mavlink1)

@@ -6,18 +6,28 @@ from enum import IntEnum
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.heading import HeadingSource
+from risaf_link.core.health import ArrayHealth, SensorState
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import encode
 
-Message = Literal["ATTITUDE_QUATERNION", "GPS_HEADING_STATUS", "ARRAY_STATUS"]
+Message = Literal[
+    "ATTITUDE_QUATERNION",
+    "GPS_HEADING_STATUS",
+    "ARRAY_STATUS",
+    "ARRAY_SENSOR_HEALTH",
+    "ARRAY_SENSOR_REASON",
+]
 
 DEFAULT_RATES: dict[Message, float] = {
     "ATTITUDE_QUATERNION": 50.0,
     "GPS_HEADING_STATUS": 5.0,
     "ARRAY_STATUS": 1.0,
+    "ARRAY_SENSOR_HEALTH": 1.0,
+    "ARRAY_SENSOR_REASON": 1.0,
 }
 """What a link emits unless told otherwise, Hz."""
 
@@ -55,6 +65,7 @@ class Emitter:
         self._system = system
         self._component = component
         self._sequence = 0
+        self._next_sensor: dict[str, int] = {}  # of messages that tell of some sensors at a time
         self._periods: dict[str, int] = {}  # which period a message was last sent in
 
     def emit(self, estimate: Estimate) -> list[bytes]:
@@ -64,8 +75,24 @@ class Emitter:
             period = math.floor(estimate.time_us * rate / 1e6)
             if period != self._periods.get(name):
                 self._periods[name] = period
-                frames.append(self._frame(name, **_FIELDS[name](estimate)))
+                frames.append(self._frame(name, **self._fields(name, estimate)))
         return frames
+
+    def _fields(self, name: str, estimate: Estimate) -> dict[str, Any]:
+        if name not in _ROUND_ROBIN:
+            return _FIELDS[name](estimate)
+        fields, most = _ROUND_ROBIN[name]
+        n = len(estimate.array.health.state)
+        first = self._next_sensor.get(name, 0)
+        first = first if first < n else 0
+        self._next_sensor[name] = first + most
+        return {
+            "time_usec": estimate.boot_us,
+            "first_sensor": first,
+            "sensor_count": min(n - first, most),
+            "array_id": estimate.array.array_id,
+            **fields(estimate.array.health, slice(first, first + most)),
+        }
 
     def heartbeat(self, state: ComponentState) -> bytes:
         """A HEARTBEAT frame."""
@@ -121,19 +148,45 @@ def _array_status(estimate: Estimate) -> dict[str, Any]:
     return {
         "time_usec": estimate.boot_us,
         "rate": fused.rate_b,
-        "rate_std": np.sqrt(fused.variance),
+        "rate_std": np.sqrt(fused.noise),
         "epochs": min(array.epochs, UINT32_LIMIT),
         "epochs_incomplete": min(array.epochs_incomplete, UINT32_LIMIT),
         "samples_lost": min(array.samples_lost, UINT32_LIMIT),
         "sensors_expected": array.sensors,
         "sensors_valid": fused.valid,
         "active": fused.active,
-        "healthy": array.health.healthy,
-        "suspect": array.health.suspect,
-        "dead": array.health.dead,
+        "healthy": array.health.count(SensorState.HEALTHY),
+        "suspect": array.health.count(SensorState.SUSPECT),
+        "dead": array.health.count(SensorState.DEAD),
         "array_id": array.array_id,
     }
 
+
+def _array_sensor_health(health: ArrayHealth, sensors: slice) -> dict[str, Any]:
+    bias = np.clip(np.rint(health.relative_bias[sensors] * 1e5), -32767, 32767)
+    percent = np.clip(np.rint(health.rejected[sensors] * 100), 0, 100)
+    return {
+        "relative_bias": _filled(bias, 90),
+        "rejected_percent": _filled(percent, 30),
+        "state": _filled(health.state[sensors], 30),
+    }
+
+
+def _array_sensor_reason(health: ArrayHealth, sensors: slice) -> dict[str, Any]:
+    return {"reason": _filled(health.reason[sensors], 120)}
+
+
+def _filled(values: NDArray[Any], length: int) -> list[int]:
+    """As integers, and zeros behind them."""
+    known: list[int] = values.ravel().astype(int).tolist()
+    return known + [0] * (length - len(known))
+
+
+_ROUND_ROBIN: dict[str, tuple[Callable[[ArrayHealth, slice], dict[str, Any]], int]] = {
+    "ARRAY_SENSOR_HEALTH": (_array_sensor_health, 30),
+    "ARRAY_SENSOR_REASON": (_array_sensor_reason, 120),
+}
+"""Messages that tell of so many sensors at a time, one block after another."""
 
 _FIELDS: dict[str, Callable[[Estimate], dict[str, Any]]] = {
     "ATTITUDE_QUATERNION": _attitude_quaternion,

@@ -1,0 +1,311 @@
+"""What the array's readings and the speed from GPS say of gravity and of rest."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from risaf_link.core.attitude import AttitudeParameters
+from risaf_link.core.earth import GRAVITY
+from risaf_link.core.eskf import (
+    LARGEST_FORCE,
+    LARGEST_GAP,
+    LARGEST_STEP,
+    LONG_STEP,
+    Correction,
+    Eskf,
+    Gravity,
+)
+from risaf_link.core.fusion import FusedRate
+from risaf_link.core.rotation import Floats
+
+PART, PARTS = 0.1, 30  # s, and their number in a mean of specific force
+HIDDEN_TIME = 1.0  # s for which one lasts that drives it
+ACCELERATION_STD = 1.5  # m/s^2, of a vehicle along its way
+ACCELERATION_TIME = 2.0  # s for which it lasts
+SPEED_LOST = 15.0  # m/s, standard deviation beyond which a speed says nothing
+SPEED_JUMP = 1.0  # m/s; a speed that changes by more at once was wrong before
+STANDING_SPEED = 0.5  # m/s; GPS shows half of it where nothing moves
+BLOCK = 0.5  # s, of rest
+STILL, STILL_ALONE, STILL_ON_ROAD = 1.0, 3.0, 6.0  # s: GPS confirms, was never there, is gone
+QUIET = np.array([0.05] * 3 + [0.5] * 3)  # rad/s, m/s^2, standard deviation within a block
+LOOSE = np.array([0.01] * 3 + [0.2] * 3)  # rad/s, m/s^2, between blocks, with GPS
+STRICT = np.array([3e-4] * 3 + [0.01] * 3)  # without
+REST_RATE, UNCONFIRMED_RATE = 1e-4, 1e-3  # rad/s, of a vehicle at rest: wind, people
+
+
+class SpeedTracker:
+    """Speed and its derivative, from speeds over ground that come late and seldom.
+
+    A Kalman filter of two states; the acceleration forgets itself, a Gauss-Markov process.
+    """
+
+    def __init__(self) -> None:
+        self._since_told = math.inf  # s
+        self._start(0.0, math.inf)
+
+    def _start(self, speed: float, variance: float) -> None:
+        self.speed = speed  # m/s
+        self.acceleration = 0.0  # m/s^2, along the vehicle
+        self.speed_variance = variance
+        self.acceleration_variance = ACCELERATION_STD**2
+        self._common = 0.0  # their covariance
+
+    @property
+    def known(self) -> bool:
+        """Whether a speed was ever told: that of a vehicle."""
+        return self.speed_variance < math.inf
+
+    @property
+    def recent(self) -> bool:
+        """Whether GPS tells the speed."""
+        return self._since_told < LARGEST_GAP
+
+    @property
+    def standing(self) -> bool:
+        """Whether GPS says that the vehicle stands."""
+        return self.recent and self.speed < STANDING_SPEED
+
+    def advance(self, dt: float) -> None:
+        """Let time pass, seconds."""
+        self._since_told += dt
+        keep = math.exp(-dt / ACCELERATION_TIME)
+        self.speed_variance += dt * (2.0 * self._common + dt * self.acceleration_variance)
+        self._common = keep * (self._common + dt * self.acceleration_variance)
+        self.speed += dt * self.acceleration
+        self.acceleration *= keep
+        change = self.acceleration_variance - ACCELERATION_STD**2
+        self.acceleration_variance = ACCELERATION_STD**2 + keep**2 * change
+
+    def hear(self, speed: float, variance: float, age: float) -> None:
+        """Use a speed over ground, m/s, of `age` seconds ago, and its variance."""
+        if not (0 <= speed < 1e3 and 0 < variance < 1e6 and 0 <= age < 10):
+            return
+        self._since_told = 0.0
+        if not self.speed_variance < SPEED_LOST**2:
+            self._start(speed, variance)
+            return
+        by_speed = self.speed_variance - age * self._common
+        by_acceleration = self._common - age * self.acceleration_variance
+        spread = by_speed - age * by_acceleration + variance
+        error = speed - (self.speed - age * self.acceleration)
+        self.speed += by_speed / spread * error
+        self.acceleration += by_acceleration / spread * error
+        self.speed_variance -= by_speed**2 / spread
+        self.acceleration_variance -= by_acceleration**2 / spread
+        self._common -= by_speed * by_acceleration / spread
+
+
+class GravityFinder:
+    """Makes gravity from specific force: means over seconds, and how far they can be believed.
+
+    In a frame that does not turn, the mean specific force is gravity and the mean acceleration
+    (Laidig and Seel, "VQF: highly accurate IMU orientation estimation with bias estimation and
+    magnetic disturbance rejection", arXiv:2203.17024). What shakes a vehicle comes to nothing; the
+    more so the more smoothly the mean begins and ends (a Hann window). Of what lasts, GPS tells
+    what the speed and the rate make (along: its derivative; across: speed times rate). The rest
+    shows itself in two ways: means differ, and the specific force is not of gravity's size,
+    `|f|^2 - g^2 = |a|^2` for a level acceleration.
+    """
+
+    def __init__(self, accel_bias_std: float) -> None:
+        self._bias_std = accel_bias_std
+        self._size = GRAVITY
+        self._doubt = 2.0 * GRAVITY * accel_bias_std  # (m/s^2)^2, of the square of the size
+        self._last: Floats | None = None  # the mean before, m/s^2, NED
+        self._speed = 0.0  # m/s, at the epoch before
+        self._unsteady = 0.0  # (m/s^2)^2, variance of the means, each axis
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was measured: the attitude between is not known."""
+        self._parts: deque[Floats] = deque(maxlen=PARTS)  # integrals of force and R_ib, turn, time
+        self._new = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._part = np.zeros((3, 4))
+        self._turned = self._time = 0.0
+
+    def take(
+        self, attitude: Eskf, force_b: Floats, dt: float, speed: SpeedTracker
+    ) -> Gravity | None:
+        """Use the specific force of one epoch; the gravity of a window that it completes."""
+        if not (np.abs(force_b) < LARGEST_FORCE).all():
+            return None
+        matrix_ib = attitude.matrix_ib
+        _, rate_y, rate_z = attitude.rate.tolist()
+        if speed.speed_variance < speed.speed**2:
+            gained = speed.speed - self._speed
+            along = gained / dt if abs(gained) < SPEED_JUMP else 0.0
+            force_b = force_b - (along, speed.speed * rate_z, -speed.speed * rate_y)
+        self._speed = speed.speed
+        self._part[:, 0] -= matrix_ib @ force_b * dt
+        self._part[:, 1:] += matrix_ib * dt
+        self._time += dt
+        self._turned += rate_z * dt
+        if self._time < PART:
+            return None
+        self._parts.append(np.array([*self._part.ravel(), self._turned, self._time]))
+        self._new += 1
+        self._begin()
+        if self._last is not None and self._new < PARTS // 2:
+            return None
+        self._new = 0
+        return self._judge(attitude.matrix_ni, speed)
+
+    def learn_size(self, size: float) -> None:
+        """Take note that the vehicle stands: of this size, m/s^2, is gravity, and it is steady."""
+        if abs(size - GRAVITY) < 0.1 * GRAVITY:
+            self._size += 0.2 * (size - self._size)
+            self._doubt = max(0.8 * self._doubt, 0.4 * GRAVITY * self._bias_std)
+        self._unsteady = 0.0
+
+    def _judge(self, matrix_ni: Floats, speed: SpeedTracker) -> Gravity:
+        parts = np.array(self._parts)
+        times = parts[:, 13]
+        weights = np.hanning(len(parts) + 2)[1:-1] * times
+        weights /= weights.sum()
+        integrals = parts[:, :12].reshape(-1, 3, 4)
+        mean_n = matrix_ni @ (weights @ (integrals[:, :, 0] / times[:, np.newaxis]))
+        since = np.cumsum(weights) - weights / 2.0  # share of the mean older than each part
+        lever = matrix_ni @ np.einsum("k,kij->ij", since, integrals[:, :, 1:])
+        span = float(times.sum()) / 2.0  # that the window is worth
+        change = mean_n - (mean_n if self._last is None else self._last)
+        self._last = mean_n
+        now = float(change @ change) / 5.0  # of 3 axes, 1/6 of each in common
+        self._unsteady += 0.2 * (now - self._unsteady)
+        hidden = abs(float(mean_n @ mean_n) - self._size**2)
+        lasting = max(2.0 * HIDDEN_TIME / span, 1.0)
+        along = across = max(hidden - self._doubt, 0.0)
+        if speed.known:
+            turning = float(parts[:, 12] @ parts[:, 12] / (times @ times))
+            along = min(hidden + self._doubt, speed.acceleration_variance)
+            across = min(hidden + self._doubt, turning * speed.speed_variance)
+        known = self._bias_std**2 + max(self._unsteady, now)
+        return Gravity(mean_n, known + lasting * along, known + lasting * across, lever)
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The mean rate of a vehicle at rest."""
+
+    rate_b: Floats  # (3,) rad/s
+    variance: Floats  # (3,) (rad/s)^2
+    size: float  # m/s^2, of the specific force; NaN: there is no accelerometer
+    confirmed: bool  # by GPS
+
+
+class RestFinder:
+    """Finds rest in the array's readings, by blocks.
+
+    At rest the readings are a constant and noise. With GPS that says so it is enough that nothing
+    shakes or changes much. Without it a smooth road looks alike: then the noise must be white (the
+    mean square of successive differences is twice the variance), and the means of blocks must agree
+    for long, to what noise allows.
+    """
+
+    def __init__(self) -> None:
+        self._reference: Floats | None = None
+        self._still = 0.0  # s
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new block."""
+        self._values: list[Floats] = []
+        self._time = 0.0
+
+    def take(self, rate_b: Floats, force_b: Floats, dt: float, speed: SpeedTracker) -> Rest | None:
+        """Use one epoch; the rest that a block which it completes shows.
+
+        Parameters
+        ----------
+        rate_b, force_b : ndarray, shape (3,)
+            rad/s, bias not taken off, and m/s^2; NaN: no accelerometer.
+        dt : float
+            s.
+        speed : SpeedTracker
+        """
+        self._values.append(np.concatenate((rate_b, force_b)))
+        self._time += dt
+        if self._time < BLOCK or len(self._values) < 5:
+            return None
+        values, time = np.array(self._values), self._time
+        self.restart()
+        with np.errstate(invalid="ignore"):
+            return self._judge(values, time, speed)
+
+    def _judge(self, values: Floats, time: float, speed: SpeedTracker) -> Rest | None:
+        if np.isnan(values[:, 3:]).any():
+            values = values[:, :3]
+        n, axes = values.shape
+        mean, variance = values.mean(axis=0), values.var(axis=0)
+        noise = (np.diff(values, axis=0) ** 2).mean(axis=0) / 2.0
+        standing = speed.standing
+        allowed = (LOOSE if standing else STRICT)[:axes]
+        quiet = (variance < QUIET[:axes] ** 2).all() and np.isfinite(mean).all()
+        if not standing:
+            white = 1.0 - min(4.0 / math.sqrt(n), 0.7)  # the ratio within 4 standard deviations
+            quiet &= bool((variance * white < noise + 1e-9).all()) and not speed.recent
+        reference = self._reference
+        agree = (
+            reference is not None
+            and len(reference) == axes
+            and (np.abs(mean - reference) < allowed + 5.0 * np.sqrt(2.0 * noise / n)).all()
+        )
+        if not (quiet and agree):
+            self._reference, self._still = mean if quiet else None, 0.0
+            return None
+        self._still += time
+        if self._still < (STILL if standing else STILL_ON_ROAD if speed.known else STILL_ALONE):
+            return None
+        floor = REST_RATE if standing else UNCONFIRMED_RATE
+        size = float(np.linalg.norm(mean[3:])) if axes > 3 else math.nan
+        return Rest(mean[:3], np.maximum(noise, variance)[:3] / n + floor**2, size, standing)
+
+
+class Aiding:
+    """Feeds a filter with what the array and the speed tell of gravity and rest.
+
+    Parameters
+    ----------
+    parameters : AttitudeParameters
+    """
+
+    def __init__(self, parameters: AttitudeParameters) -> None:
+        self.speed = SpeedTracker()
+        self._gravity = GravityFinder(parameters.accel_bias_std)
+        self._rest = RestFinder()
+
+    def take(
+        self, attitude: Eskf, fused: FusedRate, force_b: Floats, dt: float
+    ) -> tuple[Correction, ...]:
+        """Correct the attitude after a predict, where there is something to correct it by.
+
+        Parameters
+        ----------
+        attitude : Eskf
+        fused : FusedRate
+        force_b : ndarray, shape (3,)
+            Specific force, m/s^2; NaN: there is no accelerometer.
+        dt : float
+            Seconds since the epoch before.
+        """
+        if not dt > 0:
+            return ()
+        self.speed.advance(min(dt, LARGEST_STEP))
+        if dt > LONG_STEP or not np.isfinite(fused.rate_b).all():
+            self._gravity.restart()
+            self._rest.restart()
+            return ()
+        corrections: tuple[Correction, ...] = ()
+        rest = self._rest.take(fused.rate_b, force_b, dt, self.speed)
+        if rest is not None:
+            corrections += attitude.correct_zero_rate(rest.rate_b, rest.variance, rest.confirmed)
+            if corrections[0].fused:
+                self._gravity.learn_size(rest.size)
+        gravity = self._gravity.take(attitude, force_b, dt, self.speed)
+        if gravity is not None:
+            corrections += attitude.correct_gravity(gravity)
+        return corrections
