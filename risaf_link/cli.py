@@ -201,7 +201,7 @@ def replay(log: Path, config_path: Path | None, settings: tuple[str, ...], **opt
 @click.option(
     "--faults",
     metavar="NAME,NAME",
-    help="Sensor faults that are on; `none`, or `default` for the scenario's own.",
+    help="Faults of sensors and of GPS; `none`, or `default` for the scenario's own.",
 )
 def simulate(
     scenario: str, out: Path | None, url: str | None, faults: str | None, **size: Any

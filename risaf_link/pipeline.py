@@ -18,6 +18,7 @@ from risaf_link.core.attitude import AttitudeParameters, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.estimate import ArrayStatus, Estimate
 from risaf_link.core.fusion import FUSIONS, Epoch, Fusion, FusionParameters
+from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import ArrayHealth
 from risaf_link.core.robust import Robust
@@ -80,11 +81,12 @@ class Pipeline:
         self._filter: Eskf | PaperFilter
         self._aiding: Aiding | None = None
         if p.attitude.filter == "eskf":
-            self._filter, self._aiding = Eskf(p.attitude), Aiding(p.attitude)
+            self._filter, self._aiding = Eskf(p.attitude, p.heading), Aiding(p.attitude)
         else:
             self._filter = PaperFilter(p.attitude)
         self._heading = p.heading
         self._finder = HeadingFinder(p.heading)
+        self._guard = HeadingGuard(p.heading, filter_knows=self._aiding is not None)
         self._monitor = HeadingMonitor(p.heading)
         self._elapsed = 0.0  # s, of epochs
 
@@ -118,10 +120,12 @@ class Pipeline:
         fused = self._fusion.fuse(epoch)
         self._elapsed += epoch.dt
         self._filter.predict(fused, epoch.dt)
+        force_b = self._force(epoch)
         if isinstance(self._filter, Eskf) and self._aiding:
-            self._aiding.take(self._filter, fused, self._force(epoch), epoch.dt)
+            self._aiding.take(self._filter, fused, force_b, epoch.dt)
         self._monitor.advance(epoch.dt)
         attitude = self._filter.state(epoch.time_us)
+        self._guard.advance(attitude, force_b, epoch.dt)
         return Estimate(
             epoch.time_us,
             self._clock.boot_us(epoch.time_us, received_us),
@@ -136,17 +140,17 @@ class Pipeline:
         """Correct the attitude by a GPS fix."""
         motion = self._finder.take(fix, self._elapsed)
         self._monitor.note_motion(motion)
-        heading = motion.heading
+        gear = self._guard.gear.sign
+        innovation = self._guard.take(self._filter, motion)
+        if innovation and motion.heading:
+            self._monitor.note_innovation(motion.heading, innovation)
         if isinstance(self._filter, Eskf) and self._aiding:
             self._filter.set_latitude(fix.latitude)
-            self._aiding.speed.hear(motion.speed, motion.speed_std**2, self._heading.delay)
-        if heading is None:
-            return
-        measured = heading.heading, heading.variance, self._heading.delay + heading.age
-        innovation = self._filter.correct_heading(*measured, self._heading.gate)
-        if self._monitor.distrusts_filter and not innovation.fused:
-            innovation = self._filter.reset_heading(*measured, self._heading.gate)
-        self._monitor.note_innovation(heading, innovation)
+            if self._guard.gear.sign != gear:
+                self._aiding.speed.turn_round()
+            if motion.along and motion.is_news and not motion.contradicted:
+                ahead = self._guard.ahead(motion)
+                self._aiding.speed.hear(ahead, motion.speed_std**2, self._heading.delay)
 
     def _array_status(self, epoch: Epoch) -> ArrayStatus:
         counts, source = self.assembler.counts, self.assembler.source

@@ -18,6 +18,7 @@ from risaf_link.core.eskf import (
     Gravity,
 )
 from risaf_link.core.fusion import FusedRate
+from risaf_link.core.gear import STANDING_SPEED
 from risaf_link.core.rotation import Floats
 
 PART, PARTS = 0.1, 30  # s, and their number in a mean of specific force
@@ -26,7 +27,6 @@ ACCELERATION_STD = 1.5  # m/s^2, of a vehicle along its way
 ACCELERATION_TIME = 2.0  # s for which it lasts
 SPEED_LOST = 15.0  # m/s, standard deviation beyond which a speed says nothing
 SPEED_JUMP = 1.0  # m/s; a speed that changes by more at once was wrong before
-STANDING_SPEED = 0.5  # m/s; GPS shows half of it where nothing moves
 BLOCK = 0.5  # s, of rest
 STILL, STILL_ALONE, STILL_ON_ROAD = 1.0, 3.0, 6.0  # s: GPS confirms, was never there, is gone
 QUIET = np.array([0.05] * 3 + [0.5] * 3)  # rad/s, m/s^2, standard deviation within a block
@@ -36,7 +36,7 @@ REST_RATE, UNCONFIRMED_RATE = 1e-4, 1e-3  # rad/s, of a vehicle at rest: wind, p
 
 
 class SpeedTracker:
-    """Speed and its derivative, from speeds over ground that come late and seldom.
+    """Speed ahead and its derivative, from speeds that come late and seldom.
 
     A Kalman filter of two states; the acceleration forgets itself, a Gauss-Markov process.
     """
@@ -65,7 +65,7 @@ class SpeedTracker:
     @property
     def standing(self) -> bool:
         """Whether GPS says that the vehicle stands."""
-        return self.recent and self.speed < STANDING_SPEED
+        return self.recent and abs(self.speed) < STANDING_SPEED
 
     def advance(self, dt: float) -> None:
         """Let time pass, seconds."""
@@ -78,9 +78,13 @@ class SpeedTracker:
         change = self.acceleration_variance - ACCELERATION_STD**2
         self.acceleration_variance = ACCELERATION_STD**2 + keep**2 * change
 
+    def turn_round(self) -> None:
+        """Take note that the vehicle drives the other way: the gear was not known."""
+        self.speed, self.acceleration = -self.speed, -self.acceleration
+
     def hear(self, speed: float, variance: float, age: float) -> None:
-        """Use a speed over ground, m/s, of `age` seconds ago, and its variance."""
-        if not (0 <= speed < 1e3 and 0 < variance < 1e6 and 0 <= age < 10):
+        """Use a speed ahead, m/s, negative backwards, of `age` seconds ago, and its variance."""
+        if not (abs(speed) < 1e3 and 0 < variance < 1e6 and 0 <= age < 10):
             return
         self._since_told = 0.0
         if not self.speed_variance < SPEED_LOST**2:

@@ -59,10 +59,7 @@ class AttitudeParameters(Struct, frozen=True, forbid_unknown_fields=True):
     gravity_distrust: Annotated[float, Meta(gt=0)] = 3.0
     """`eskf`: s of rejection after which the tilt, not gravity, is held to be wrong."""
     distrust: Annotated[float, Meta(gt=0)] = 10.0
-    """`eskf`: s of rejection after which yaw, or at rest the bias, is held to be wrong."""
-    reversing: Annotated[float, Meta(gt=0)] = 60.0
-    """`eskf`: s for which a vehicle may drive backwards: a course opposite to yaw is no reason for
-    distrust."""
+    """`eskf`: s of rest that contradicts the bias after which the bias is held to be wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,13 +177,24 @@ class PaperFilter:
         """
         if self._turn_variance() > UNKNOWN_YAW**2:
             return self.reset_heading(heading, variance, age, gate)
+        innovation = self.compare_heading(heading, variance, age, gate)
+        if innovation.fused:
+            direction = _euler_jacobian(self._q)[2]
+            gain = self._covariance[:, ATTITUDE] @ direction / innovation.variance
+            self._correct(gain, innovation.value, direction, variance)
+        return innovation
+
+    def compare_heading(
+        self, heading: float, variance: float, age: float, gate: float
+    ) -> Innovation:
+        """Hold a heading against the state, which stays as it is.
+
+        Parameters are those of `correct_heading`.
+        """
         error = wrap(heading - self._yaw_before(age))
         direction = _euler_jacobian(self._q)[2]
-        gain = self._covariance[:, ATTITUDE] @ direction
-        innovation = Innovation(error, float(direction @ gain[ATTITUDE]) + variance, gate)
-        if innovation.fused:
-            self._correct(gain / innovation.variance, error, direction, variance)
-        return innovation
+        spread = float(direction @ self._covariance[ATTITUDE, ATTITUDE] @ direction) + variance
+        return Innovation(error, spread, gate)
 
     def reset_heading(self, heading: float, variance: float, age: float, gate: float) -> Innovation:
         """Set yaw by a heading, whatever it was; roll, pitch and bias stay.

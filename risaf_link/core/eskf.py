@@ -10,6 +10,10 @@ arXiv:1711.02508, chapter 7: global angular errors). In that frame
   "Intrinsic filtering on Lie groups with applications to attitude estimation", arXiv:1310.2539);
 - a late heading is compared with the attitude of its own time: every correction since then is a
   rotation on the left, which that attitude takes just as well.
+
+What is wrong with the headings is part of the state: an offset, which no averaging takes away, so
+that yaw is never held to be better known than that; and how much later they are than told, which
+turns show.
 """
 
 import math
@@ -24,13 +28,18 @@ from numpy.typing import NDArray
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
 from risaf_link.core.fusion import FusedRate
+from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, wrap
 
 ATTITUDE = slice(0, 3)  # error: rotation vector, rad, NED
 BIAS = slice(3, 6)  # error of the fused rate's bias, rad/s, body
+HEADING = slice(6, 8)  # what is wrong with the headings:
+OFFSET = 6  # rad, by which all of them are off: antennas, a crabbing vehicle
+LATE = 7  # s, by which they are later than told
 DOWN = 2
-LEVEL, BIAS_AXES = np.arange(2), np.arange(3, 6)  # for diagonals
-IDENTITY = np.eye(6)
+LEVEL, BIAS_AXES, HEADING_AXES = np.arange(2), np.arange(3, 6), np.arange(6, 8)  # for diagonals
+STATES = 8
+IDENTITY = np.eye(STATES)
 
 HISTORY = 1024  # epochs; a second at 1 kHz
 LONG_STEP = 0.5  # s; over a longer one nothing is known of the rate
@@ -39,7 +48,11 @@ LARGEST_RATE = 1e3  # rad/s; no gyro measures more
 LARGEST_FORCE = 1e4  # m/s^2; no accelerometer measures more
 LARGEST_STEP = 3600.0  # s; afterwards nothing is known anyway
 LARGEST_GAP = 2.5  # s; what is further apart is not one run
+OFFSET_TIME, LATE_TIME = 300.0, 1000.0  # s, in which what is wrong with headings becomes another
+RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
 STEEP = 0.99  # sine of the pitch beyond which a heading says nothing of yaw: 82 deg
+
+USUAL_HEADING = HeadingParameters()
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -91,9 +104,13 @@ class Eskf:
     Parameters
     ----------
     parameters : AttitudeParameters
+    heading : HeadingParameters
+        Of them `offset_std` and `delay_std`.
     """
 
-    def __init__(self, parameters: AttitudeParameters) -> None:
+    def __init__(
+        self, parameters: AttitudeParameters, heading: HeadingParameters = USUAL_HEADING
+    ) -> None:
         p = self._parameters = parameters
         self._by_rate: Quaternion = (1.0, 0.0, 0.0, 0.0)  # the rate's integral alone
         self._correction: Quaternion = (1.0, 0.0, 0.0, 0.0)  # on its left: q_nb is their product
@@ -103,7 +120,10 @@ class Eskf:
         self._turned: Vector = (0.0, 0.0, 0.0)  # rotation vector of the last step
         tilt = p.initial_tilt_std**2
         bias = p.initial_bias_std**2
-        self._covariance = np.diag([tilt, tilt, math.pi**2, bias, bias, bias])
+        wrong = [heading.offset_std**2, heading.delay_std**2]
+        self._covariance = np.diag([tilt, tilt, math.pi**2, bias, bias, bias, *wrong])
+        self._wrong = np.zeros(2)  # what the headings are held to be off by: rad, s
+        self._wrong_variance = np.array(wrong)  # that it comes back to
         self._latitude = math.nan
         self._aligned = False
         self._levelled = False
@@ -153,11 +173,11 @@ class Eskf:
 
     @property
     def covariance(self) -> Floats:
-        """Covariance of the error, (6, 6): `ATTITUDE`, `BIAS`.
+        """Covariance of the error of attitude and bias, (6, 6): `ATTITUDE`, `BIAS`.
 
         That of the accelerometers' bias, which no correction takes away, is added to the tilt.
         """
-        covariance = self._covariance.copy()
+        covariance = self._covariance[:6, :6].copy()
         if self._levelled:
             covariance[LEVEL, LEVEL] += (self._parameters.accel_bias_std / GRAVITY) ** 2
         return covariance
@@ -193,56 +213,68 @@ class Eskf:
         matrix_nb = _matrix(_between(before, self._attitude, 0.5))
         self._spread(matrix_nb, fused, unseen, dt)
 
+    def compare_heading(
+        self, heading: float, variance: float, age: float, gate: float
+    ) -> Correction | None:
+        """Hold a heading against the state, which stays as it is; None: it cannot be.
+
+        Parameters are those of `correct_heading`.
+        """
+        if not _usable(heading, variance, age):
+            return None
+        row, error = self._by_heading(heading, age)
+        if row is None:
+            return None
+        spread = float(row @ self._covariance @ row) + variance
+        inside = error * error <= gate * gate * spread
+        outcome = Outcome.FUSED if inside else Outcome.REJECTED
+        return Correction(error, spread, gate, False, "heading", outcome)
+
     def correct_heading(
         self, heading: float, variance: float, age: float, gate: float
     ) -> Correction:
         """Fuse a heading; the first one sets yaw.
 
-        After `distrust` seconds of rejection it sets yaw again, unless the vehicle seems to be
-        driving backwards.
-
         Parameters
         ----------
         heading, variance : float
-            rad from true north, and rad^2.
+            rad from true north, and rad^2, of its noise.
         age : float
-            How long ago it was valid, seconds. It is compared with the yaw of that time.
+            How long ago it was valid, seconds, so far as is told. It is compared with the yaw of
+            that time.
         gate : float
             Standard deviations of the innovation beyond which a heading is rejected.
         """
         if not _usable(heading, variance, age):
             return Correction(heading, variance, gate, False, "heading", Outcome.NOT_FINITE)
-        matrix_then = _matrix(self._attitude_before(age))
-        error = wrap(heading - math.atan2(matrix_then[1, 0], matrix_then[0, 0]))
-        if abs(matrix_then[2, 0]) > STEEP:
+        row, error = self._by_heading(heading, age)
+        if row is None:
             spread = float(self._covariance[DOWN, DOWN]) + variance
             return Correction(error, spread, gate, False, "heading", Outcome.UNOBSERVABLE)
         if not self._aligned:
             return self.reset_heading(heading, variance, age, gate)
-        rows = (_yaw_row(matrix_then, age),)
-        (correction,) = self._fuse_all("heading", rows, (error,), (variance,), gate)
-        if not correction.fused and self._distrusts_yaw(error):
-            return self.reset_heading(heading, variance, age, gate)
+        (correction,) = self._fuse_all("heading", (row,), (error,), (variance,), gate)
         return correction
 
     def reset_heading(self, heading: float, variance: float, age: float, gate: float) -> Correction:
         """Set yaw by a heading, whatever it was; the tilt and the bias stay."""
         if not _usable(heading, variance, age):
             return Correction(heading, variance, gate, False, "heading", Outcome.NOT_FINITE)
-        error = wrap(heading - _yaw(self._attitude_before(age)))
+        age = self._true_age(age)
+        error = wrap(heading - float(self._wrong[0]) - _yaw(self._attitude_before(age)))
         spread = float(self._covariance[DOWN, DOWN]) + variance
         self._turn((0.0, 0.0, error))
         cosine, sine = math.cos(error), math.sin(error)
         rotation = IDENTITY.copy()
         rotation[0:2, 0:2] = [[cosine, -sine], [sine, cosine]]
         rotation[DOWN, DOWN] = 0.0  # what was known of yaw, and its part in all else
+        rotation[DOWN, HEADING] = -1.0, self._yaw_rate_before(age)
         self._covariance = rotation @ self._covariance @ rotation.T
-        self._covariance[DOWN, DOWN] = min(variance, math.pi**2)
+        self._covariance[DOWN, DOWN] += min(variance, math.pi**2)
         if not self._aligned:
             self._doubt_bias_for_earth_rate()
         self._aligned = True
         self._resets += 1
-        self._rejecting.pop("heading", None)
         return Correction(error, spread, gate, True, "heading", Outcome.RESET)
 
     def correct_gravity(self, gravity: Gravity) -> tuple[Correction, ...]:
@@ -266,7 +298,7 @@ class Eskf:
         if not self._levelled:
             return self._level(about_n, max(gravity.forward, gravity.right) * scale)
         yaw = _yaw(self._attitude)
-        rows = np.zeros((2, 6))
+        rows = np.zeros((2, STATES))
         rows[:, 0:2] = [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
         rows[:, BIAS] = rows[:, ATTITUDE] @ gravity.lever
         errors = [float(row[0:2] @ about_n) for row in rows]
@@ -353,7 +385,11 @@ class Eskf:
         angle, walk = self._noise(fused, unseen, dt)
         transition = IDENTITY.copy()
         transition[ATTITUDE, BIAS] = matrix_nb * -dt
+        kept = np.exp([-dt / OFFSET_TIME, -dt / LATE_TIME])
+        transition[HEADING_AXES, HEADING_AXES] = kept
+        self._wrong = self._wrong * kept
         covariance = transition @ self._covariance @ transition.T
+        covariance[HEADING_AXES, HEADING_AXES] += self._wrong_variance * (1.0 - kept * kept)
         covariance[ATTITUDE, ATTITUDE] += (matrix_nb * angle) @ matrix_nb.T
         covariance[BIAS_AXES, BIAS_AXES] += walk
         self._covariance = (covariance + covariance.T) / 2.0
@@ -378,7 +414,7 @@ class Eskf:
         """Let no angle be less known than not at all: pi. Scaling keeps the matrix positive."""
         covariance = self._covariance
         if max(covariance[0, 0], covariance[1, 1], covariance[2, 2]) > math.pi**2:
-            scale = np.ones(6)
+            scale = np.ones(STATES)
             scale[ATTITUDE] = np.minimum(math.pi / np.sqrt(covariance.diagonal()[ATTITUDE]), 1.0)
             self._covariance = covariance * np.outer(scale, scale)
 
@@ -432,12 +468,13 @@ class Eskf:
             for error, spread in zip(errors, spreads, strict=True)
         )
         self._note(source, passed)
-        change = np.zeros(6)
+        change = np.zeros(STATES)
         if passed:
             for row, error, variance in zip(rows, errors, variances, strict=True):
                 change += self._gain(row, variance) * (error - float(row @ change))
             self._turn((float(change[0]), float(change[1]), float(change[2])))
             self._bias = self._bias + change[BIAS]
+            self._wrong = self._wrong + change[HEADING]
         outcome = Outcome.FUSED if passed else Outcome.REJECTED
         return tuple(
             Correction(error, spread, gate, False, source, outcome)
@@ -470,11 +507,29 @@ class Eskf:
         began, last = self._rejecting.get(source, (math.inf, self._elapsed))
         return last == self._elapsed and last - began >= after
 
-    def _distrusts_yaw(self, error: float) -> bool:
-        """Whether yaw is wrong, not the headings; a vehicle may drive backwards for a while."""
-        p = self._parameters
-        backwards = math.cos(error) < -math.sqrt(0.5) and not self._at_rest
-        return self._distrusts("heading", p.reversing if backwards else p.distrust)
+    def _by_heading(self, heading: float, age: float) -> tuple[Floats | None, float]:
+        """Derivative of a heading by the error, (8,), and the innovation.
+
+        None while the vehicle points up or down: it says nothing of yaw.
+        """
+        age = self._true_age(age)
+        matrix_then = _matrix(self._attitude_before(age))
+        yaw_then = math.atan2(matrix_then[1, 0], matrix_then[0, 0])
+        error = wrap(heading - float(self._wrong[0]) - yaw_then)
+        if abs(matrix_then[2, 0]) > STEEP:
+            return None, error
+        row = _yaw_row(matrix_then, age)
+        row[HEADING] = 1.0, -self._yaw_rate_before(age)
+        return row, error
+
+    def _true_age(self, told: float) -> float:
+        return max(told + float(self._wrong[1]), 0.0)
+
+    def _yaw_rate_before(self, age: float) -> float:
+        """Rate of yaw `age` seconds ago, rad/s."""
+        since, until = age + RATE_SPAN, max(age - RATE_SPAN, 0.0)
+        turned = _yaw(self._attitude_before(until)) - _yaw(self._attitude_before(since))
+        return wrap(turned) / (since - until)
 
     def _attitude_before(self, age: float) -> Quaternion:
         """Attitude of `age` seconds ago, as known now; the oldest where that is too long ago."""
@@ -498,12 +553,12 @@ def _usable(heading: float, variance: float, age: float) -> bool:
 
 
 def _yaw_row(matrix_nb: Floats, age: float) -> Floats:
-    """Yaw's derivative by the error, `age` after the attitude, shape (6,).
+    """Yaw's derivative by the error, `age` after the attitude, shape (8,).
 
     With the forward axis x: `d yaw = angle_D - x_D (x_N angle_N + x_E angle_E) / (x_N^2 + x_E^2)`;
     the angle of then is that of now and what the bias has done since.
     """
-    row = np.zeros(6)
+    row = np.zeros(STATES)
     row[DOWN] = 1.0
     north, east, down = matrix_nb[:, 0].tolist()
     level = max(north * north + east * east, 1.0 - STEEP**2)

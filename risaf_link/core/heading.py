@@ -5,7 +5,8 @@ Massive Array of MEMS IMUs".
 """
 
 import math
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Annotated, Literal
 
@@ -15,24 +16,36 @@ from risaf_link.core.attitude import AttitudeState, Innovation
 from risaf_link.core.earth import radii
 from risaf_link.core.rotation import wrap
 
+Metres = Annotated[float, Meta(ge=-1000, le=1000)]
+
 RELATIVE_POSITION_NOISE = 0.1
 """Noise between two consecutive positions as a share of the receiver's absolute accuracy: most of
 a receiver's position error changes within minutes, not between fixes."""
 
 UNKNOWN_POSITION_STD = 1.0  # m, where a receiver does not say
 UNKNOWN_SPEED_STD = 0.1  # m/s, likewise
+LEAST_SPEED_STD = 0.05  # m/s; Doppler is not better, whatever a receiver says
+RESOLUTION = 1e-3  # rad, of a course or yaw
+WITNESS_TIME = 5.0  # s for which velocity is added up and held against positions
+WITNESS_GATE = 4.0  # standard deviations of a position
+WITNESS_SHARE = 0.2  # of the way: the course is filtered, and later or earlier than the position
+ANTENNA_PATIENCE = 10.0  # s for which two antennas that have no yaw now are waited for
 
 
 class HeadingParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """How a heading is made from GPS fixes, and when it is believed."""
 
     source: Literal["auto", "velocity", "positions", "positions_raw", "dual_antenna"] = "auto"
+    course_is_heading: Literal["auto", "always", "never"] = "auto"
     min_speed: Annotated[float, Meta(ge=0)] = 1.0  # m/s
     gate: Annotated[float, Meta(gt=0)] = 3.0  # standard deviations of the innovation
     delay: Annotated[float, Meta(ge=0, le=1)] = 0.11  # s from a fix's validity to its arrival
-    min_std: Annotated[float, Meta(gt=0)] = 0.02  # rad, of any heading
+    delay_std: Annotated[float, Meta(ge=0, le=1)] = 0.1  # s
+    offset_std: Annotated[float, Meta(ge=0, le=1)] = 0.003  # rad, of what does not average out
+    yaw_offset: Annotated[float, Meta(ge=-7, le=7)] = 0.0  # rad, second antenna from forward
+    antenna: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)  # m, forward, right, down
     timeout: Annotated[float, Meta(gt=0)] = 2.0  # s without a fix until it is gone
-    reset_after: Annotated[float, Meta(gt=0)] = 7.0  # s of rejected headings
+    reset_after: Annotated[float, Meta(gt=0)] = 10.0  # s of rejected headings
 
 
 class HeadingSource(IntEnum):
@@ -59,6 +72,8 @@ class GpsFix:
     speed_std: float  # m/s
     course_std: float  # rad, of course or yaw
     position_std: float  # m, horizontal
+    yaw_capable: bool = False  # it has two antennas, whether they have a yaw now or not
+    course_is_heading: bool = True  # so far as its sender tells: of a vehicle that hovers it is not
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +93,57 @@ class Motion:
     speed: float  # m/s over ground, NaN: not known
     heading: Heading | None  # None: too slow, or nothing to make it from
     speed_std: float = UNKNOWN_SPEED_STD  # m/s
+    course: float = field(default=math.nan, compare=False)  # rad; NaN: too slow, or not known
+    along: bool = True  # the vehicle goes where it points, or backwards
+    is_news: bool = True  # position or velocity differ from those of the fix before
+    contradicted: bool = False  # by the receiver's own positions
+
+
+class PositionWitness:
+    """Holds a receiver's velocity against its own positions, over some seconds.
+
+    What the velocity adds up to must be the way between the positions. A receiver that was once
+    seen to agree with itself, on a way longer than its positions err, and then does not is frozen,
+    has jumped or is led astray; one that never agreed says nothing by it.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self._timeout = timeout
+        self._seen: deque[tuple[float, GpsFix, float, float, float]] = deque()
+        self._was_borne_out = False
+
+    def contradicts(self, fix: GpsFix, time_s: float) -> bool:
+        """Whether the positions speak against the velocity of a fix that came at `time_s`."""
+        if not all(map(math.isfinite, _content(fix))):
+            self._seen.clear()
+            return False
+        north = east = way = 0.0
+        if self._seen:
+            before_s, before, north, east, way = self._seen[-1]
+            timed = fix.time_us and before.time_us
+            elapsed = (fix.time_us - before.time_us) / 1e6 if timed else time_s - before_s
+            if not 0 < elapsed <= self._timeout:
+                self._seen.clear()
+            for part in (before, fix):  # the trapezoidal rule
+                north += 0.5 * elapsed * part.speed * math.cos(part.course)
+                east += 0.5 * elapsed * part.speed * math.sin(part.course)
+                way += 0.5 * elapsed * part.speed
+            time_s = before_s + elapsed
+        self._seen.append((time_s, fix, north, east, way))
+        while self._seen[-1][0] - self._seen[0][0] > WITNESS_TIME:
+            self._seen.popleft()
+        _, first, first_north, first_east, first_way = self._seen[0]
+        per_north, per_east = radii((fix.latitude + first.latitude) / 2)
+        missed = math.hypot(
+            float(per_north) * (fix.latitude - first.latitude) - (north - first_north),
+            float(per_east) * wrap(fix.longitude - first.longitude) - (east - first_east),
+        )
+        spread = math.sqrt(2.0) * _known(fix.position_std, UNKNOWN_POSITION_STD)
+        allowed = WITNESS_GATE * spread + WITNESS_SHARE * (way - first_way)
+        if missed <= allowed:
+            self._was_borne_out |= way - first_way > 1.5 * allowed
+            return False
+        return self._was_borne_out
 
 
 class HeadingFinder:
@@ -87,13 +153,17 @@ class HeadingFinder:
     position to this one (eq. 4) with the convergence of the meridians put right; `positions_raw`
     eq. 4 to the letter, in angles of longitude and latitude; `dual_antenna` the yaw that the
     receiver measures. `auto` takes the first of dual antenna, velocity, positions that a fix
-    allows. All but the antennas need `min_speed`: for positions it is the speed between the two
-    points, section III.A. A direction between two points is the course half-way between them.
+    allows; antennas that had a yaw, or say that they can, are waited for. All but the antennas need
+    a vehicle whose course is its heading, and `min_speed`: for positions it is the speed between
+    the two points, section III.A. A direction between two points is the course half-way between
+    them.
     """
 
     def __init__(self, parameters: HeadingParameters) -> None:
         self._parameters = parameters
         self._previous: tuple[GpsFix, float] | None = None
+        self._witness = PositionWitness(parameters.timeout)
+        self._yaw_s = -math.inf  # when there was a yaw, or could have been for the first time
 
     def take(self, fix: GpsFix, time_s: float) -> Motion:
         """Use the next fix.
@@ -105,26 +175,48 @@ class HeadingFinder:
         time_s : float
             When it came, seconds; stands in where the fix itself has no time.
         """
-        source = self._parameters.source
+        previous = self._previous[0] if self._previous else None
         track = self._track(fix, time_s)
-        speed = fix.speed if math.isfinite(fix.speed) else track.speed
-        speed_std = _known(fix.speed_std, track.speed_std)
+        by_track = self._parameters.source.startswith("positions") or math.isnan(fix.speed)
+        motion = Motion(
+            track.speed if by_track else fix.speed,
+            self._choose(fix, track, time_s),
+            track.speed_std if by_track else _known(fix.speed_std, UNKNOWN_SPEED_STD),
+            fix.course if fix.speed >= self._parameters.min_speed else math.nan,
+            self._goes_ahead(fix),
+            previous is None or _content(fix) != _content(previous),
+        )
+        return replace(motion, contradicted=self._witness.contradicts(fix, time_s))
+
+    def _goes_ahead(self, fix: GpsFix) -> bool:
+        told = self._parameters.course_is_heading
+        return fix.course_is_heading if told == "auto" else told == "always"
+
+    def _choose(self, fix: GpsFix, track: Motion, time_s: float) -> Heading | None:
+        source = self._parameters.source
         if source in {"auto", "dual_antenna"} and math.isfinite(fix.yaw):
-            return Motion(
-                speed, self._heading(fix.yaw, fix.course_std, HeadingSource.DUAL_ANTENNA), speed_std
-            )
-        if source == "dual_antenna":
-            return Motion(speed, None, speed_std)
+            self._yaw_s = time_s
+            yaw = fix.yaw - self._parameters.yaw_offset
+            return _heading(yaw, _known(fix.course_std, 0.0), HeadingSource.DUAL_ANTENNA)
+        if fix.yaw_capable:
+            self._yaw_s = time_s if math.isinf(self._yaw_s) else self._yaw_s
+        awaited = source == "auto" and time_s - self._yaw_s < ANTENNA_PATIENCE
+        if source == "dual_antenna" or awaited or not self._goes_ahead(fix):
+            return None
         by_velocity = math.isfinite(fix.course) and math.isfinite(fix.speed)
         if source == "velocity" or (source == "auto" and by_velocity):
-            return Motion(speed, self._from_velocity(fix) if by_velocity else None, speed_std)
-        return track
+            return self._from_velocity(fix) if by_velocity else None
+        return track.heading
 
     def _from_velocity(self, fix: GpsFix) -> Heading | None:
+        """Course over ground: as good as the worse of what the receiver says in two ways."""
         if fix.speed < self._parameters.min_speed:
             return None
-        across = _known(fix.speed_std, UNKNOWN_SPEED_STD) / max(fix.speed, 1e-3)
-        return self._heading(fix.course, _known(fix.course_std, across), HeadingSource.VELOCITY)
+        told = math.isfinite(fix.course_std) and fix.course_std > 0
+        speed_std = _known(fix.speed_std, LEAST_SPEED_STD if told else UNKNOWN_SPEED_STD)
+        across = max(speed_std, LEAST_SPEED_STD) / max(fix.speed, 1e-3)
+        std = max(fix.course_std, across) if told else across
+        return _heading(fix.course, std, HeadingSource.VELOCITY)
 
     def _track(self, fix: GpsFix, time_s: float) -> Motion:
         """Speed and heading from the previous position to this one."""
@@ -148,13 +240,16 @@ class HeadingFinder:
         angle, source = math.atan2(east, north), HeadingSource.POSITIONS
         if self._parameters.source == "positions_raw":
             angle, source = math.atan2(turned_east, turned_north), HeadingSource.POSITIONS_RAW
-        return Motion(speed, self._heading(angle, std, source, elapsed / 2))
+        return Motion(speed, _heading(angle, std, source, elapsed / 2))
 
-    def _heading(
-        self, angle: float, std: float, source: HeadingSource, age: float = 0.0
-    ) -> Heading:
-        std = min(max(_known(std, 0.0), self._parameters.min_std), math.pi)
-        return Heading(wrap(angle), std * std, source, age)
+
+def _heading(angle: float, std: float, source: HeadingSource, age: float = 0.0) -> Heading:
+    std = min(max(std, RESOLUTION), math.pi)
+    return Heading(wrap(angle), std * std, source, age)
+
+
+def _content(fix: GpsFix) -> tuple[float, ...]:
+    return fix.latitude, fix.longitude, fix.speed, fix.course
 
 
 class HeadingState(IntEnum):
@@ -190,8 +285,7 @@ class HeadingMonitor:
     Parameters
     ----------
     parameters : HeadingParameters
-        `timeout` seconds after the last fix there is none; after `reset_after` seconds of rejected
-        headings, none of them longer than `timeout` after the one before, the filter is distrusted.
+        `timeout` seconds after the last fix there is none.
     """
 
     def __init__(self, parameters: HeadingParameters) -> None:
@@ -199,21 +293,15 @@ class HeadingMonitor:
         self._motion = Motion(math.nan, None)
         self._heading: Heading | None = None
         self._innovation: Innovation | None = None
-        self._since_fix = self._since_heading = math.inf
+        self._since_fix = math.inf
         self._since_fused = math.nan
-        self._rejecting_for = 0.0
         self._fused_count = 0
         self._rejected_count = 0
 
     def advance(self, dt: float) -> None:
         """Let time pass, seconds."""
         self._since_fix += dt
-        self._since_heading += dt
         self._since_fused += dt
-        if self._since_heading > self._parameters.timeout:
-            self._rejecting_for = 0.0
-        elif self._innovation is not None and not self._innovation.fused:
-            self._rejecting_for += dt
 
     def note_motion(self, motion: Motion) -> None:
         """Take note of a usable fix."""
@@ -223,17 +311,11 @@ class HeadingMonitor:
     def note_innovation(self, heading: Heading, innovation: Innovation) -> None:
         """Take note of what the filter made of a heading."""
         self._heading, self._innovation = heading, innovation
-        self._since_heading = 0.0
         if innovation.fused:
             self._fused_count += 1
-            self._since_fused = self._rejecting_for = 0.0
+            self._since_fused = 0.0
         else:
             self._rejected_count += 1
-
-    @property
-    def distrusts_filter(self) -> bool:
-        """Whether headings were rejected for so long that the filter must be wrong, not they."""
-        return self._rejecting_for > self._parameters.reset_after
 
     def status(self, attitude: AttitudeState) -> HeadingStatus:
         """Read the account at an epoch."""

@@ -12,6 +12,7 @@ GpsMessage = Literal["GPS_RAW_INT", "GPS2_RAW", "GPS_INPUT", "HIL_GPS", "GLOBAL_
 USABLE_FIX = 3  # GPS_FIX_TYPE_3D_FIX
 IGNORE_VELOCITY, IGNORE_SPEED_ACCURACY, IGNORE_POSITION_ACCURACY = 8, 32, 64
 UNKNOWN = 65535
+NEVER = 0  # of a yaw: the receiver has one antenna
 RIGHT_ANGLE = 900_000_000  # degE7
 
 
@@ -34,6 +35,7 @@ def _gps_raw(read: Callable[[bytes], tuple[Any, ...]], payload: bytes) -> Report
             vel_acc * 1e-3 or math.nan,
             _angle(hdg_acc, 1e-5) or math.nan,
             h_acc * 1e-3 or math.nan,
+            yaw != NEVER,
         )
     )
 
@@ -42,7 +44,8 @@ def _hil_gps(payload: bytes) -> Report:
     time_us, fix_type, lat, lon, vel, cog, yaw, receiver = _HIL_GPS(payload)
     position, motion = _position(lat, lon), _motion(vel, cog)
     accuracy = (math.nan, math.nan, math.nan)
-    fix = GpsFix(time_us, fix_type >= USABLE_FIX, *position, *motion, _yaw(yaw), *accuracy)
+    usable, capable = fix_type >= USABLE_FIX, yaw != NEVER
+    fix = GpsFix(time_us, usable, *position, *motion, _yaw(yaw), *accuracy, capable)
     return Report(fix, receiver)
 
 
@@ -59,6 +62,7 @@ def _gps_input(payload: bytes) -> Report:
         speed_std if not ignored & IGNORE_SPEED_ACCURACY else math.nan,
         math.nan,
         position_std if not ignored & IGNORE_POSITION_ACCURACY else math.nan,
+        yaw != NEVER,
     )
     return Report(fix, receiver)
 
@@ -91,7 +95,7 @@ def _motion(vel: int, cog: int) -> tuple[float, float]:
 
 def _yaw(centidegrees: int) -> float:
     """Yaw of two antennas: 0 is "never", 65535 "not now", 36000 north."""
-    return math.nan if centidegrees in {0, UNKNOWN} else _angle(centidegrees, 1e-2)
+    return math.nan if centidegrees in {NEVER, UNKNOWN} else _angle(centidegrees, 1e-2)
 
 
 def _polar(north: float, east: float) -> tuple[float, float]:

@@ -7,7 +7,7 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar, cast
 
 import numpy as np
@@ -33,6 +33,13 @@ ARRAY_SIZE = 254  # payload of GYRO_ARRAY and ACCEL_ARRAY; its last bytes: senso
 ARRAY_CAPACITY, DEBUG_CAPACITY = 40, 19  # sensors a message
 SCALED_IMUS = [IDS["SCALED_IMU"], IDS["SCALED_IMU2"], IDS["SCALED_IMU3"]]
 FINEST_FIRST = [IDS["HIGHRES_IMU"], IDS["RAW_IMU"], *SCALED_IMUS]
+NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+SIDEWAYS = frozenset({1, 2, 3, 4, 7, 8, *range(12, 18), *range(19, 26), 28, 29, 35, 37, 43, 45, 47})
+"""MAV_TYPE of what goes where it does not point: it hovers, drifts with the wind, or dives.
+
+Aeroplanes, rotorcraft, airships, balloons, submarines, kites, parafoils. What is not listed, rovers
+and boats among it, goes where it points.
+"""
 STALE_FIX_US = 10_000_000  # a fix that is older by less came late; by more, the clock has jumped
 
 Key = TypeVar("Key", bound=Hashable)
@@ -97,6 +104,7 @@ class Ingest:
         self._imus = Streams(FINEST_FIRST)
         self._autopilot: Source | None = None  # whose they are
         self._last_fixes: dict[Hashable, tuple[int, bytes]] = {}
+        self._sideways: dict[int, bool] = {}  # vehicles: whether they go where they do not point
         self._readers: dict[int, Callable[[Frame, int], GyroChunk | GpsFix | None]] = {
             IDS["IMU_ARRAY_INFO"]: self._array_info,
             IDS["GYRO_ARRAY"]: self._gyro_array,
@@ -105,6 +113,7 @@ class Ingest:
             IDS["HIGHRES_IMU"]: self._highres_imu,
             IDS["RAW_IMU"]: self._raw_imu,
             **dict.fromkeys(SCALED_IMUS, self._scaled_imu),
+            IDS["HEARTBEAT"]: self._heartbeat,
             **{IDS[name]: self._gps for name in gps.messages},
         }
 
@@ -270,6 +279,11 @@ class Ingest:
 
     # GPS
 
+    def _heartbeat(self, frame: Frame, _: int) -> None:
+        vehicle_type, autopilot = _HEARTBEAT(frame.payload)
+        if autopilot != NO_AUTOPILOT:
+            _remember(self._sideways, frame.system, vehicle_type in SIDEWAYS)
+
     def _gps(self, frame: Frame, received_us: int) -> GpsFix | None:
         name = cast("GpsMessage", name_of(frame.message_id))
         fix, number = READERS[name](frame.payload)
@@ -285,6 +299,8 @@ class Ingest:
         if not self._receivers.admits(receiver, rank, received_us):
             self.counts["other_source"] += 1
             return None
+        if self._sideways.get(frame.system, False):
+            return replace(fix, course_is_heading=False)
         return fix
 
     def _is_repeated(self, receiver: Hashable, fix: GpsFix, payload: bytes) -> bool:
@@ -333,6 +349,7 @@ _INFO = reader(
 )
 _DEBUG = reader("DEBUG_FLOAT_ARRAY", "time_usec", "name", "array_id", "data")
 _HIGHRES = reader("HIGHRES_IMU", "time_usec", *_IMU, "id")
+_HEARTBEAT = reader("HEARTBEAT", "type", "autopilot")
 _RAW = reader("RAW_IMU", "time_usec", *_IMU, "id")
 _SCALED = reader("SCALED_IMU", "time_boot_ms", *_IMU)
 _HIL_STATE = reader("HIL_STATE_QUATERNION", "time_usec", "attitude_quaternion")

@@ -30,6 +30,8 @@ def gps(scenario: Scenario) -> Iterator[Message]:
     """
     receiver = scenario.receiver
     f = fixes(scenario.trajectory, scenario.duration, receiver, scenario.generator("receiver"))
+    for fault in scenario.receiver_faults.values():
+        f = fault.spoil(f)
     lost = is_lost(f.arrival_s, scenario.outages)
     last = np.maximum.accumulate(np.where(lost, -1, np.arange(len(lost))))
 

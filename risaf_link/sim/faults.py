@@ -1,4 +1,4 @@
-"""The faults of sensors by name, and which of them are on.
+"""The faults of sensors by name, and which of them, and of the receiver's, are on.
 
 Every fault can be switched on and off without a change to any other, or to the sensors' noise.
 Those that strike a share of the array strike different sensors, as far as there are enough.
@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from risaf_link.errors import ConfigError
 from risaf_link.sim.disturbances import Ramps, Scale, Shocks, Spikes, Steps, Thermal
 from risaf_link.sim.failures import Dropouts, Frozen, Invalid, Saturated
+from risaf_link.sim.receiver_faults import RECEIVER_FAULTS, ReceiverFault
 from risaf_link.sim.target import Fault
 
 ONSET = (30.0, 200.0)  # s: in the aided part of a drive, or in the outage
@@ -40,15 +41,23 @@ OF_CHIPS = frozenset({"frozen", "saturated", "invalid", "dropouts"})
 WORDS = ("none", "default")
 
 
-def choose(names: Iterable[str] | None, own: Mapping[str, Fault]) -> dict[str, Fault]:
+def choose(
+    names: Iterable[str] | None, own: Mapping[str, Fault]
+) -> tuple[dict[str, Fault], dict[str, ReceiverFault]]:
     """Switch faults on.
 
     Parameters
     ----------
     names : iterable of str or None
-        Of `FAULTS`; `default` stands for the scenario's own, `none` for nothing. None: its own.
+        Of `FAULTS` and `RECEIVER_FAULTS`; `default` stands for the scenario's own, `none` for
+        nothing. None: its own.
     own : mapping
         A scenario's own faults; where it has one, its parameters hold.
+
+    Returns
+    -------
+    faults, receiver_faults : dict
+        Of sensors, and of the GPS receiver.
 
     Raises
     ------
@@ -56,15 +65,16 @@ def choose(names: Iterable[str] | None, own: Mapping[str, Fault]) -> dict[str, F
         If there is no such fault.
     """
     on = set(own) if names is None else set(_expand(names, own))
-    return {name: own.get(name, usual) for name, usual in FAULTS.items() if name in on}
+    faults = {name: own.get(name, usual) for name, usual in FAULTS.items() if name in on}
+    return faults, {name: usual for name, usual in RECEIVER_FAULTS.items() if name in on}
 
 
 def _expand(names: Iterable[str], own: Mapping[str, Fault]) -> Iterator[str]:
     for name in names:
-        if name in FAULTS:
+        if name in FAULTS or name in RECEIVER_FAULTS:
             yield name
         elif name == "default":
             yield from own
         elif name != "none":
-            known = ", ".join([*FAULTS, *WORDS])
+            known = ", ".join([*FAULTS, *RECEIVER_FAULTS, *WORDS])
             raise ConfigError(f"faults: {name!r}, expected one of {known}")

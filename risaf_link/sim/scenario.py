@@ -20,6 +20,7 @@ from risaf_link.sim.equipment import (
 from risaf_link.sim.failures import Frozen, Saturated
 from risaf_link.sim.faults import FAULTS, choose
 from risaf_link.sim.receiver import ReceiverParameters
+from risaf_link.sim.receiver_faults import ReceiverFault
 from risaf_link.sim.routes import OUTAGE, PARAN, hills, paved, unpaved
 from risaf_link.sim.sensors import TriadErrors
 from risaf_link.sim.target import Fault
@@ -51,6 +52,7 @@ class Scenario:
     sensors: int
     rate: float  # Hz, epochs
     faults: Mapping[str, Fault] = field(default_factory=dict)  # those that are on
+    receiver_faults: Mapping[str, ReceiverFault] = field(default_factory=dict)  # likewise
     outages: tuple[tuple[float, float], ...] = ()  # s; the receiver has no fix from, until
     seed: int = 0
 
@@ -171,8 +173,8 @@ def scenario(
     duration, sensors, rate : optional
         Seconds, number, Hz; the scenario's own where None.
     faults : iterable of str, optional
-        Those that are on, of `FAULTS`; `default` stands for the scenario's own, `none` for nothing.
-        The scenario's own where None. The drive, the noise and every other fault stay the same.
+        Those that are on, of `FAULTS` and `RECEIVER_FAULTS`; `default` stands for the scenario's
+        own, `none` for nothing. The scenario's own where None. The drive, the noise and every other fault stay the same.
 
     Raises
     ------
@@ -183,11 +185,13 @@ def scenario(
     if make is None:
         raise ConfigError(f"scenario: {name!r}, expected one of {', '.join(SCENARIOS)}")
     chosen = make(_generator(seed, "route"))
+    of_sensors, of_receiver = choose(faults, chosen.faults)
     return replace(
         chosen,
         seed=seed,
         duration=chosen.duration if duration is None else duration,
         sensors=chosen.sensors if sensors is None else sensors,
         rate=chosen.rate if rate is None else rate,
-        faults=choose(faults, chosen.faults),
+        faults=of_sensors,
+        receiver_faults=of_receiver,
     )

@@ -1,0 +1,293 @@
+"""What is done with a heading: fused, rejected, or believed against the filter.
+
+A filter's gate judges one heading at a time. That is not enough: a receiver that is led astray
+slowly stays within the gate and takes yaw with it, and a filter that is itself wrong rejects all
+that is right. So the headings are judged together.
+
+- The mean of the last innovations must be as small as that of so many independent ones: in a filter
+  whose model holds they are white (Kailath, "An innovations approach to least-squares estimation",
+  IEEE Transactions on Automatic Control 13(6), 1968). A slow drift shows there long before it shows
+  in one innovation.
+- Headings that the receiver's own positions contradict are not used.
+- Yaw is set anew by rejected headings only if they agree with one another and with the gyros, which
+  is to say if they are all off by the same angle, and if they do so for as long as yaw was
+  confirmed before: ten seconds of headings do not outweigh minutes.
+- The course of a vehicle in reverse is turned round.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from risaf_link.core.attitude import AttitudeState, Innovation, PaperFilter
+from risaf_link.core.eskf import Eskf
+from risaf_link.core.gear import STANDING_SPEED, Gear
+from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
+from risaf_link.core.rotation import Floats, wrap
+
+SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
+MEMORY = 25  # innovations in a mean
+MEAN_GATE = 4.0  # standard deviations of the mean beyond which headings are rejected
+MEAN_TRUST = 2.0  # and within which they are trusted again
+LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
+OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
+AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
+RATES = 1024  # epochs; a second at 1 kHz
+RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
+
+Estimator = Eskf | PaperFilter
+Measured = tuple[float, float, float]
+"""rad, rad^2, s ago: a heading of the vehicle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refused(Innovation):
+    """An innovation that was not used, though it may be within the gate."""
+
+    @property
+    def fused(self) -> bool:
+        """False."""
+        return False
+
+
+class Whiteness:
+    """Whether innovations have a mean that independent ones would not have."""
+
+    def __init__(self) -> None:
+        self._mean = 0.0  # of innovations in their standard deviations
+        self.is_broken = False
+
+    def add(self, innovation: Innovation) -> None:
+        """Take the next innovation, one within the gate."""
+        ratio = innovation.value / math.sqrt(innovation.variance)
+        self._mean += (ratio - self._mean) / MEMORY
+        size = abs(self._mean) * math.sqrt(2 * MEMORY - 1)  # in its own standard deviations
+        self.is_broken = size > (MEAN_TRUST if self.is_broken else MEAN_GATE)
+
+
+class Dispute:
+    """Headings rejected one after another.
+
+    Parameters
+    ----------
+    longest : float
+        Seconds for which they are remembered.
+    """
+
+    def __init__(self, longest: float) -> None:
+        self._longest = longest
+        self._since = 0.0
+        self._rejected: deque[tuple[float, float, float]] = deque()  # s, rad, rad^2
+
+    def settle(self) -> None:
+        """Take note of a heading that was fused, or of a pause."""
+        self._rejected.clear()
+
+    def add(self, time_s: float, error: float, variance: float) -> None:
+        """Take an innovation, rad, and the variance of its heading."""
+        if not self._rejected:
+            self._since = time_s
+        self._rejected.append((time_s, error, variance))
+        while time_s - self._rejected[0][0] > self._longest:
+            self._rejected.popleft()
+
+    def is_won(self, after: float) -> bool:
+        """Whether the headings have agreed for so many seconds that they are all off alike."""
+        last_s, last_error, _ = self._rejected[-1]
+        if last_s - self._since < after:
+            return False
+        recent = np.array([row for row in self._rejected if last_s - row[0] <= after])
+        times, errors, variances = recent.T
+        errors = np.remainder(errors - last_error + math.pi, math.tau) - math.pi
+        older = times < last_s - after / 2.0
+        halves = [errors[older], errors[~older]]
+        if not all(map(len, halves)):
+            return False
+        noise = math.sqrt(float(variances.mean()))
+        apart = abs(float(halves[0].mean() - halves[1].mean()))
+        spread = math.sqrt(sum(float(half.var()) * len(half) for half in halves) / len(errors))
+        return (
+            apart < AGREEMENT + 6.0 * noise / math.sqrt(len(errors))
+            and spread < AGREEMENT + 2.0 * noise
+        )
+
+
+class HeadingGuard:
+    """Stands between headings and a filter.
+
+    Parameters
+    ----------
+    parameters : HeadingParameters
+    filter_knows : bool
+        Whether the filter itself models that headings are off and late.
+
+    Attributes
+    ----------
+    gear : Gear
+    """
+
+    def __init__(self, parameters: HeadingParameters, filter_knows: bool) -> None:
+        self._parameters = parameters
+        self._filter_knows = filter_knows
+        self.gear = Gear()
+        self._whiteness = Whiteness()
+        self._dispute = Dispute(LONGEST_DEFENCE * parameters.reset_after)
+        self._elapsed = 0.0  # s
+        self._last = -math.inf  # s, when the last heading came
+        self._turned: deque[tuple[float, Floats]] = deque([(0.0, np.zeros(3))], maxlen=RATES)
+        self._aligned = False
+        self._confirmed = 0.0  # s for which headings have agreed with yaw
+
+    def advance(self, attitude: AttitudeState, force_b: Floats, dt: float) -> None:
+        """Take note of an epoch: the filter's state, the specific force, m/s^2, the time, s."""
+        self._elapsed += dt
+        self._aligned = attitude.aligned
+        self._turned.append((self._elapsed, self._turned[-1][1] + attitude.rate_b * dt))
+        self.gear.feel(attitude.q_nb, force_b.tolist(), dt)
+
+    def take(self, estimator: Estimator, motion: Motion) -> Innovation | None:
+        """Use what one fix says; None: it says nothing of heading."""
+        self._hear(motion)
+        if motion.heading is None:
+            return None
+        pause = self._elapsed - self._last
+        self._last = self._elapsed
+        if pause > self._parameters.timeout:
+            self._pause(pause)
+        if not self._aligned:
+            self.gear.align()
+            return self._set(estimator.correct_heading, self._measured(motion))
+        if _is_course(motion) and self.gear.denies_yaw:
+            self.gear.turn_round()
+            return self._set(estimator.reset_heading, self._measured(motion))
+        return self._judge(estimator, motion, pause)
+
+    def ahead(self, motion: Motion) -> float:
+        """Speed of the vehicle, not the antenna, ahead, m/s; negative backwards."""
+        rate_x, rate_y, rate_z = self._rate_before(self._parameters.delay)
+        x, y, z = self._parameters.antenna
+        across = rate_z * x - rate_x * z
+        along = math.sqrt(max(motion.speed**2 - across**2, 0.0))
+        return self.gear.sign * along + rate_z * y - rate_y * z
+
+    def _hear(self, motion: Motion) -> None:
+        """Let the gear be known by speed, and by course where yaw is measured."""
+        if not motion.along or motion.contradicted:
+            return
+        if math.isfinite(motion.speed):
+            self.gear.hear(motion.speed, motion.speed_std, self._elapsed)
+        if motion.heading and not _is_course(motion) and math.isfinite(motion.course):
+            ahead = math.cos(motion.course - motion.heading.heading) > 0.0
+            self.gear.confirm(1 if ahead else -1)
+
+    def _judge(self, estimator: Estimator, motion: Motion, pause: float) -> Innovation:
+        gate = self._parameters.gate
+        measured, compared = self._compare(estimator, motion)
+        if compared is None:
+            return estimator.correct_heading(*measured, gate)
+        if not motion.contradicted:
+            if compared.test_ratio <= 1.0:
+                self._whiteness.add(compared)
+                if not self._whiteness.is_broken:
+                    return self._fuse(estimator, motion, measured, pause)
+            self._dispute.add(self._elapsed, compared.value, measured[1])
+            if self._dispute.is_won(self._patience(compared, motion.speed)):
+                return self._set(estimator.reset_heading, measured)
+        return Refused(compared.value, compared.variance, gate)
+
+    def _fuse(
+        self, estimator: Estimator, motion: Motion, measured: Measured, pause: float
+    ) -> Innovation:
+        self._dispute.settle()
+        if pause <= self._parameters.timeout:
+            self._confirmed += pause
+        if _is_course(motion):
+            self.gear.confirm(self.gear.sign)
+        return estimator.correct_heading(*measured, self._parameters.gate)
+
+    def _compare(self, estimator: Estimator, motion: Motion) -> tuple[Measured, Innovation | None]:
+        """Hold a heading against the filter, in the gear that agrees with it."""
+        gate = self._parameters.gate
+        measured = self._measured(motion)
+        compared = estimator.compare_heading(*measured, gate)
+        if compared and compared.test_ratio > 1.0 and _is_course(motion) and self.gear.may_change:
+            self.gear.sign = -self.gear.sign
+            turned = self._measured(motion)
+            other = estimator.compare_heading(*turned, gate)
+            if other and other.test_ratio <= 1.0:
+                return turned, other
+            self.gear.sign = -self.gear.sign
+        return measured, compared
+
+    def _measured(self, motion: Motion) -> Measured:
+        """Heading of the vehicle, where that measured is of an antenna's motion."""
+        p, heading = self._parameters, motion.heading
+        if heading is None:
+            raise ValueError("motion: found no heading, expected one")
+        age = p.delay + heading.age
+        rate_x, _, rate_z = self._rate_before(age)
+        angle, variance = heading.heading, heading.variance
+        if _is_course(motion):
+            across = rate_z * p.antenna[0] - rate_x * p.antenna[2]
+            along = math.sqrt(max(motion.speed**2 - across**2, 0.0))
+            angle -= math.atan2(across, self.gear.sign * along)
+            variance += (SIDE_SLIP * motion.speed * rate_z) ** 2
+        if not self._filter_knows:
+            variance += p.offset_std**2 + (rate_z * p.delay_std) ** 2
+        return wrap(angle), min(variance, math.pi**2), age
+
+    def _set(
+        self, how: Callable[[float, float, float, float], Innovation], measured: Measured
+    ) -> Innovation:
+        """Let a heading set yaw, by a method of the filter."""
+        innovation = how(*measured, self._parameters.gate)
+        self._aligned = self._aligned or innovation.reset
+        self._whiteness = Whiteness()
+        self._dispute.settle()
+        self._confirmed = 0.0
+        self.gear.confirm(self.gear.sign)
+        return innovation
+
+    def _pause(self, seconds: float) -> None:
+        """Take note that there was no heading for a while: yaw is less certain."""
+        self._confirmed = max(self._confirmed - seconds, 0.0)
+        self._whiteness = Whiteness()
+        self._dispute.settle()
+        self.gear.may_change = True
+
+    def _patience(self, compared: Innovation, speed: float) -> float:
+        """Seconds for which yaw is defended: as long as it was confirmed, within limits.
+
+        At rest nothing but the antennas can have moved; on the move a vehicle does not turn round
+        at once.
+        """
+        shortest = self._parameters.reset_after
+        longest = LONGEST_DEFENCE * shortest
+        if speed < STANDING_SPEED:
+            return shortest
+        if math.cos(compared.value) < OPPOSITE:
+            return longest
+        return min(max(self._confirmed, shortest), longest)
+
+    def _rate_before(self, age: float) -> tuple[float, float, float]:
+        """Rate `age` seconds ago, rad/s, body."""
+        until_s, until = self._turned_before(max(age - RATE_SPAN, 0.0))
+        since_s, since = self._turned_before(age + RATE_SPAN)
+        if not until_s > since_s:
+            return 0.0, 0.0, 0.0
+        x, y, z = ((until - since) / (until_s - since_s)).tolist()
+        return x, y, z
+
+    def _turned_before(self, age: float) -> tuple[float, Floats]:
+        for entry in reversed(self._turned):
+            if entry[0] <= self._elapsed - age + 1e-9:
+                return entry
+        return self._turned[0]
+
+
+def _is_course(motion: Motion) -> bool:
+    """Whether its heading is the direction of motion."""
+    return motion.heading is not None and motion.heading.source is not HeadingSource.DUAL_ANTENNA
