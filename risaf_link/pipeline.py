@@ -125,7 +125,7 @@ class Pipeline:
             self._aiding.take(self._filter, fused, force_b, epoch.dt)
         self._monitor.advance(epoch.dt)
         attitude = self._filter.state(epoch.time_us)
-        self._guard.advance(attitude, force_b, epoch.dt)
+        attitude = self._guard.advance(attitude, force_b, epoch.dt)
         return Estimate(
             epoch.time_us,
             self._clock.boot_us(epoch.time_us, received_us),

@@ -387,6 +387,23 @@ class TestGps:
         assert math.cos(fix_of(name, **fix, yaw=36000).yaw) == pytest.approx(1.0)
         assert fix_of(name, **fix, yaw=9000).yaw == pytest.approx(math.pi / 2)
 
+    @pytest.mark.parametrize("name", ["GPS_RAW_INT", "GPS2_RAW", "HIL_GPS", "GPS_INPUT"])
+    def test_a_receiver_without_a_yaw_now_is_told_from_one_with_one_antenna(self, name):
+        fix = INPUT_FIX if name == "GPS_INPUT" else RAW_FIX
+        assert not fix_of(name, **fix, yaw=0).yaw_capable
+        assert fix_of(name, **fix, yaw=65535).yaw_capable
+        assert fix_of(name, **fix, yaw=9000).yaw_capable
+
+    @pytest.mark.parametrize(
+        ("vehicle_type", "autopilot", "heads"),
+        [(2, 3, False), (1, 12, False), (13, 3, False), (10, 3, True), (11, 3, True), (2, 8, True)],
+    )
+    def test_what_hovers_or_flies_says_so_by_its_heartbeat(self, vehicle_type, autopilot, heads):
+        service = ingest()
+        heartbeat = {"base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3}
+        service.decode(frame("HEARTBEAT", type=vehicle_type, autopilot=autopilot, **heartbeat), 0)
+        assert service.decode(frame("GPS_RAW_INT", **RAW_FIX), 0).course_is_heading is heads
+
     def test_gps_input_has_velocity_and_accuracies_in_si_units(self):
         fix = fix_of("GPS_INPUT", **INPUT_FIX, speed_accuracy=0.5, horiz_accuracy=2.0)
         assert fix.speed == pytest.approx(5.0)
@@ -632,7 +649,8 @@ class TestWhateverComes:
 
 
 def test_ids_of_this_file_are_what_the_service_reads():
-    assert {IDS[name] for name in READ[:14]} == set(Service().ingest._readers)
+    names = [*READ[:14], "HEARTBEAT"]
+    assert {IDS[name] for name in names} == set(Service().ingest._readers)
 
 
 def test_the_autopilot_is_the_sender_by_default():

@@ -1,6 +1,7 @@
 """Frames in, estimates out: what the estimator says when this and that happens."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +10,14 @@ from vehicle import Vehicle
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.fusion import FusionParameters
 from risaf_link.core.heading import HeadingState
+from risaf_link.core.rotation import yaw_of
 from risaf_link.mavlink import risaf
-from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.frame import Frame, FrameParser
 from risaf_link.mavlink.telemetry import Emitter
 from risaf_link.pipeline import Pipeline, PipelineParameters
+from risaf_link.sim.receiver_faults import RECEIVER_FAULTS
+from risaf_link.sim.scenario import BOOT_US, scenario
+from risaf_link.sim.stream import frames
 
 OWN = (1, 191)
 PERIOD_US = 10_000
@@ -69,14 +74,42 @@ def test_a_slow_vehicle_has_a_fix_but_no_heading(drive):
 
 def test_a_heading_that_jumps_is_rejected_and_believed_only_after_a_while(drive):
     drive.go(20, course=0.5)
-    rejecting = drive.go(5, course=-2.0)
+    rejecting = drive.go(5, course=1.5)
     assert rejecting.heading.state is HeadingState.REJECTING
     assert rejecting.heading.yaw == pytest.approx(0.5, abs=0.02)
     assert rejecting.heading.rejected_count == 25
     assert rejecting.attitude.resets == 1
-    later = drive.go(5, course=-2.0)
+    assert drive.go(14, course=1.5).attitude.resets == 1
+    later = drive.go(2, course=1.5)
     assert later.attitude.resets == 2
-    assert later.heading.yaw == pytest.approx(-2.0, abs=0.02)
+    assert later.heading.yaw == pytest.approx(1.5, abs=0.02)
+
+
+def errors_of(chosen, begin, end):
+    """Errors of yaw between two times, and the same in standard deviations."""
+    pipeline, parser = Pipeline(PipelineParameters(), OWN), FrameParser()
+    rows = [
+        ((e.time_us - BOOT_US) / 1e6, e.heading.yaw, e.heading.yaw_std, e.attitude.resets)
+        for time_us, raw in frames(chosen)
+        for frame in parser.receive_data(raw)
+        for e in pipeline.step(frame, time_us)
+    ]
+    time_s, yaw, std, resets = np.array([r for r in rows if begin < r[0] < end]).T
+    true_yaw = np.array([yaw_of(q_nb) for q_nb in chosen.trajectory(time_s).q_nb])
+    assert resets.max() == 1
+    errors = np.remainder(yaw - true_yaw + math.pi, math.tau) - math.pi
+    return np.degrees(errors), errors / std
+
+
+@pytest.mark.parametrize("fault", list(RECEIVER_FAULTS))
+def test_gps_that_is_present_but_wrong_is_no_worse_than_none(fault):
+    """The fault lasts from 50 to 90 s; an outage of that length is the measure."""
+    sound = scenario("ekf2", 1, duration=95.0, rate=50.0, faults=["none"])
+    spoilt = replace(sound, receiver_faults={fault: RECEIVER_FAULTS[fault]})
+    without, _ = errors_of(replace(sound, outages=((50.0, 90.0),)), 50.0, 90.0)
+    errors, ratios = errors_of(spoilt, 50.0, 95.0)
+    assert np.sqrt(np.mean(ratios**2)) < 1.5
+    assert np.abs(errors).max() < np.abs(without).max() + 0.5
 
 
 def test_a_receiver_that_repeats_its_last_fix_is_gone(drive):

@@ -12,6 +12,8 @@ from risaf_link.sim.failures import Dropouts, Frozen, Invalid, Saturated
 from risaf_link.sim.faults import FAULTS, OF_CHIPS
 from risaf_link.sim.pace import Pace, SpeedChange
 from risaf_link.sim.readings import readings, strikes
+from risaf_link.sim.receiver import fixes
+from risaf_link.sim.receiver_faults import RECEIVER_FAULTS
 from risaf_link.sim.scenario import CONSUMER_GYROS, scenario
 from risaf_link.sim.sensors import TriadArray, TriadErrors
 from risaf_link.sim.target import Target
@@ -281,7 +283,8 @@ def test_an_unknown_fault_is_refused_and_the_known_ones_are_named(names):
         scenario("circle", 1, faults=names)
     assert str(error.value) == (
         f"faults: {names[-1]!r}, expected one of spikes, shocks, scale, thermal, steps, ramps, "
-        "frozen, saturated, invalid, dropouts, none, default"
+        "frozen, saturated, invalid, dropouts, gps_jump, gps_drift, gps_spoofed, gps_position, "
+        "gps_frozen, none, default"
     )
 
 
@@ -291,3 +294,60 @@ def test_a_scenario_keeps_its_own_parameters_of_a_fault():
     assert chosen.faults["shocks"] == scenario("drive2", 1).faults["shocks"]
     assert scenario("drive2", 1, faults=["none"]).faults == {}
     assert list(scenario("drive2", 1).faults) == ["shocks", "frozen", "saturated"]
+
+
+# The receiver's
+
+
+def reports(name, duration=60.0):
+    """What a receiver reports with a fault from 50 s on, and without."""
+    chosen = scenario("circle", 4, duration)
+    sound = fixes(chosen.trajectory, duration, chosen.receiver, chosen.generator("receiver"))
+    return RECEIVER_FAULTS[name].spoil(sound), sound
+
+
+def course_errors(name):
+    spoilt, sound = reports(name)
+    errors = np.degrees(np.remainder(spoilt.course - sound.course + math.pi, math.tau) - math.pi)
+    assert np.abs(errors[sound.time_s < 50.0]).max() < 1e-9
+    return errors, sound.time_s - 50.0
+
+
+def test_a_course_can_jump_or_drift():
+    jump, since = course_errors("gps_jump")
+    assert jump[since >= 0.0] == pytest.approx(45.0)
+    for name in ("gps_drift", "gps_spoofed"):
+        drift, since = course_errors(name)
+        assert drift[since >= 0.0] == pytest.approx(0.5 * since[since >= 0.0], abs=1e-9)
+
+
+def test_a_spoofed_way_is_that_of_its_velocity_and_a_drifting_course_is_not():
+    for name, agrees in (("gps_spoofed", True), ("gps_drift", False)):
+        spoilt, sound = reports(name)
+        off = np.radians(0.5) * np.maximum(sound.time_s - 50.0, 0.0)
+        moved = (spoilt.latitude[-1] - sound.latitude[-1]) * 6.37e6
+        expected = float(np.sum(sound.speed * (np.cos(sound.course + off) - np.cos(sound.course))))
+        assert bool(abs(moved - expected * 0.2) < 0.2) is agrees
+
+
+def test_a_frozen_receiver_repeats_its_report_with_new_times_and_comes_back():
+    spoilt, sound = reports("gps_frozen", duration=100.0)
+    during = (sound.time_s >= 50.0) & (sound.time_s < 90.0)
+    for values in (spoilt.latitude, spoilt.longitude, spoilt.speed, spoilt.course):
+        assert len(np.unique(values[during])) == 1
+    assert np.array_equal(spoilt.time_s, sound.time_s)
+    assert np.array_equal(spoilt.course[~during], sound.course[~during])
+
+
+def test_a_position_jumps_and_its_velocity_does_not():
+    spoilt, sound = reports("gps_position")
+    north = (spoilt.latitude - sound.latitude) * 6.36e6
+    assert north[sound.time_s >= 50.0] == pytest.approx(300.0, rel=0.01)
+    assert np.array_equal(spoilt.course, sound.course)
+
+
+def test_faults_of_sensors_and_of_the_receiver_are_chosen_alike():
+    chosen = scenario("drive2", 1, faults=["gps_frozen", "default"])
+    assert chosen.faults == scenario("drive2", 1).faults
+    assert chosen.receiver_faults == {"gps_frozen": RECEIVER_FAULTS["gps_frozen"]}
+    assert scenario("drive2", 1).receiver_faults == {}

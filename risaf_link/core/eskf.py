@@ -528,6 +528,8 @@ class Eskf:
     def _yaw_rate_before(self, age: float) -> float:
         """Rate of yaw `age` seconds ago, rad/s."""
         since, until = age + RATE_SPAN, max(age - RATE_SPAN, 0.0)
+        if not until < since < math.inf:  # so long ago that nothing is known
+            return 0.0
         turned = _yaw(self._attitude_before(until)) - _yaw(self._attitude_before(since))
         return wrap(turned) / (since - until)
 

@@ -18,7 +18,7 @@ that is right. So the headings are judged together.
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,9 +29,10 @@ from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
 from risaf_link.core.rotation import Floats, wrap
 
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
-MEMORY = 25  # innovations in a mean
-MEAN_GATE = 4.0  # standard deviations of the mean beyond which headings are rejected
-MEAN_TRUST = 2.0  # and within which they are trusted again
+MEMORY = 15  # innovations in a mean
+LONG_MEMORY = 30  # corrections of yaw that a drift may have made before it shows
+MEAN_GATE = 3.0  # standard deviations of the mean beyond which headings are rejected
+MEAN_TRUST = 1.5  # and within which they are trusted again
 LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
 AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
@@ -54,11 +55,20 @@ class Refused(Innovation):
 
 
 class Whiteness:
-    """Whether innovations have a mean that independent ones would not have."""
+    """Whether innovations have a mean that independent ones would not have.
+
+    Attributes
+    ----------
+    is_broken : bool
+    doubt : float
+        rad, by which yaw may have been led astray before that showed.
+    """
 
     def __init__(self) -> None:
         self._mean = 0.0  # of innovations in their standard deviations
+        self._pulled = 0.0  # rad, by the last innovations together
         self.is_broken = False
+        self.doubt = 0.0
 
     def add(self, innovation: Innovation) -> None:
         """Take the next innovation, one within the gate."""
@@ -66,6 +76,21 @@ class Whiteness:
         self._mean += (ratio - self._mean) / MEMORY
         size = abs(self._mean) * math.sqrt(2 * MEMORY - 1)  # in its own standard deviations
         self.is_broken = size > (MEAN_TRUST if self.is_broken else MEAN_GATE)
+
+    def note_refused(self) -> None:
+        """Take note that a heading was not used: those before it may have been wrong already."""
+        self.doubt = max(self.doubt, abs(self._pulled))
+
+    def pause(self) -> None:
+        """Forget the innovations; what they did to yaw remains."""
+        self._mean = self._pulled = 0.0
+        self.is_broken = False
+
+    def note_fused(self, innovation: Innovation, noise: float) -> None:
+        """Take note that yaw was corrected, by a heading of this variance, rad^2."""
+        gain = 1.0 - noise / innovation.variance
+        self._pulled += gain * innovation.value - self._pulled / LONG_MEMORY
+        self.doubt *= 1.0 - gain
 
 
 class Dispute:
@@ -141,12 +166,22 @@ class HeadingGuard:
         self._aligned = False
         self._confirmed = 0.0  # s for which headings have agreed with yaw
 
-    def advance(self, attitude: AttitudeState, force_b: Floats, dt: float) -> None:
-        """Take note of an epoch: the filter's state, the specific force, m/s^2, the time, s."""
+    def advance(self, attitude: AttitudeState, force_b: Floats, dt: float) -> AttitudeState:
+        """Take note of an epoch: the filter's state, the specific force, m/s^2, the time, s.
+
+        Returns
+        -------
+        AttitudeState
+            With the doubt about yaw that headings have left, which no filter knows of.
+        """
         self._elapsed += dt
         self._aligned = attitude.aligned
         self._turned.append((self._elapsed, self._turned[-1][1] + attitude.rate_b * dt))
         self.gear.feel(attitude.q_nb, force_b.tolist(), dt)
+        if not self._whiteness.doubt:
+            return attitude
+        yaw_std = math.hypot(attitude.yaw_std, self._whiteness.doubt)
+        return replace(attitude, yaw_std=min(yaw_std, math.pi))
 
     def take(self, estimator: Estimator, motion: Motion) -> Innovation | None:
         """Use what one fix says; None: it says nothing of heading."""
@@ -192,10 +227,12 @@ class HeadingGuard:
             if compared.test_ratio <= 1.0:
                 self._whiteness.add(compared)
                 if not self._whiteness.is_broken:
+                    self._whiteness.note_fused(compared, measured[1])
                     return self._fuse(estimator, motion, measured, pause)
             self._dispute.add(self._elapsed, compared.value, measured[1])
             if self._dispute.is_won(self._patience(compared, motion.speed)):
                 return self._set(estimator.reset_heading, measured)
+        self._whiteness.note_refused()
         return Refused(compared.value, compared.variance, gate)
 
     def _fuse(
@@ -254,7 +291,7 @@ class HeadingGuard:
     def _pause(self, seconds: float) -> None:
         """Take note that there was no heading for a while: yaw is less certain."""
         self._confirmed = max(self._confirmed - seconds, 0.0)
-        self._whiteness = Whiteness()
+        self._whiteness.pause()
         self._dispute.settle()
         self.gear.may_change = True
 

@@ -95,7 +95,7 @@ class Motion:
     speed_std: float = UNKNOWN_SPEED_STD  # m/s
     course: float = field(default=math.nan, compare=False)  # rad; NaN: too slow, or not known
     along: bool = True  # the vehicle goes where it points, or backwards
-    is_news: bool = True  # position or velocity differ from those of the fix before
+    is_news: bool = field(default=True, compare=False)  # it differs from the fix before
     contradicted: bool = False  # by the receiver's own positions
 
 

@@ -5,7 +5,7 @@ Times are in seconds from the start.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,9 +55,10 @@ class LedAstray:
         lasts = _lasts(since, self.length)
         course = fixes.course + np.where(lasts, self.slope * since, 0.0)
         step = np.diff(fixes.time_s, prepend=fixes.time_s[:1])
-        north: Floats = np.cumsum(fixes.speed * (np.cos(course) - np.cos(fixes.course)) * step)
-        east: Floats = np.cumsum(fixes.speed * (np.sin(course) - np.sin(fixes.course)) * step)
-        return replace(_moved(fixes, lasts * north, lasts * east), course=_wrapped(course))
+        north = np.cumsum(fixes.speed * (np.cos(course) - np.cos(fixes.course)) * step)
+        east = np.cumsum(fixes.speed * (np.sin(course) - np.sin(fixes.course)) * step)
+        moved = _moved(fixes, lasts * north, lasts * east)
+        return replace(moved, course=_wrapped(course))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ def _lasts(since: Floats, length: float) -> NDArray[np.bool_]:
     return lasts
 
 
-def _moved(fixes: Fixes, north: Floats, east: Floats) -> Fixes:
+def _moved(fixes: Fixes, north: NDArray[Any], east: NDArray[Any]) -> Fixes:
     per_north, per_east = radii(fixes.latitude, fixes.altitude)
     return replace(
         fixes,

@@ -174,7 +174,8 @@ def scenario(
         Seconds, number, Hz; the scenario's own where None.
     faults : iterable of str, optional
         Those that are on, of `FAULTS` and `RECEIVER_FAULTS`; `default` stands for the scenario's
-        own, `none` for nothing. The scenario's own where None. The drive, the noise and every other fault stay the same.
+        own, `none` for nothing. The scenario's own where None. The drive, the noise and every other
+        fault stay the same.
 
     Raises
     ------
