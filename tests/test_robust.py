@@ -188,13 +188,23 @@ def test_the_stated_bias_walk_is_that_of_the_fused_bias():
     assert 30.8 / 48 < np.mean(squares) < 69.0 / 48  # 48 draws of chi-square
 
 
-def test_where_nothing_changes_no_single_sensor_is_blamed():
-    """Coarse counts of a vehicle at rest look so."""
+def test_everything_at_once_frozen_is_flagged_and_no_reason_to_stop():
     drive = Drive(10, 12.0)
     drive.readings[drive.at(10) :] = drive.readings[drive.at(10)]
     results, robust = drive.fused()
-    assert (robust.health().state == SensorState.HEALTHY).all()
+    assert (robust.health().state == SensorState.DEAD).all()
+    assert (robust.health().reason == Reason.FROZEN).all()
     assert np.isfinite(rates(results)).all()
+
+
+def test_counts_that_are_coarser_than_the_noise_do_not_look_frozen_at_rest():
+    drive = Drive(4, 20.0, walk=0.0)
+    noise = drive.readings - drive.truth[:, np.newaxis] - drive.bias
+    drive.truth[drive.at(10) :] = 0.0
+    drive.readings = drive.truth[:, np.newaxis] + drive.bias + 0.01 * noise
+    drive.readings = np.rint(drive.readings / 0.001) * 0.001
+    _, robust = drive.fused()
+    assert not (robust.health().reason == Reason.FROZEN).any()
 
 
 def test_a_shock_to_all_passes_and_leaves_every_sensor_trusted_in_the_end():
