@@ -360,7 +360,7 @@ class Robust:
         time = min(max(2 / 3 * self._elapsed, WATCH_TIME), p.bias_time)
         noise = np.where(np.isnan(white), 0.0, white)
         walk = 2 * (time + WATCH_TIME) / time**2 * slow - dt / (WATCH_TIME * time) * noise
-        walk = self._averaged_walk(np.nan_to_num(walk), dt)
+        walk = self._averaged_walk(np.where(np.isnan(walk), 0.0, walk), dt)
         told = count - 1  # one sensor has no residual
         walk = (PRIOR * p.bias_walk**2 + told * np.maximum(walk, 0.0)) / (PRIOR + told)
         if dt > 0 and moved.any():
