@@ -231,7 +231,7 @@ class Robust:
         """
         c = self._channels
         change = np.abs(readings - c.reading)
-        changed = change > 0.0  # false for the first
+        changed = valid & (change > 0.0)  # false for the first
         c.count = np.where(changed, np.fmin(c.count, change), c.count)
         c.unchanged += dt * valid
         c.unchanged *= ~changed
