@@ -3,10 +3,10 @@
     python benchmarks/estimator.py drive2 --seeds 10 --methods robust risaf median mean
     python benchmarks/estimator.py ekf2 --seeds 10 --set heading.delay=0
 
-Every run is a whole simulation, its frames through the service's own pipeline; all methods are given
-the same frames. A row is one method over all seeds: RMS of the heading's error in the outage, or of
-the whole run where there is none; RMS of error over stated standard deviation of each angle over
-the whole run; and the mean normalised innovation squared of the headings that were fused.
+Every run is a whole simulation, its frames through the service's own pipeline; all methods are
+given the same frames. A row is one method over all seeds: RMS of the heading's error in the outage,
+or of the whole run where there is none; RMS of error over stated standard deviation of each angle
+over the whole run; and the mean normalised innovation squared of the headings that were fused.
 """
 
 import argparse
@@ -53,9 +53,7 @@ def run(
                     if heading.fused_count > fused[i] and heading.innovation:
                         fused[i] = heading.fused_count
                         if not heading.innovation.reset:
-                            nis[i].append(
-                                heading.innovation.value**2 / heading.innovation.variance
-                            )
+                            nis[i].append(heading.innovation.value**2 / heading.innovation.variance)
                     if attitude.aligned:
                         stds = (attitude.roll_std, attitude.pitch_std, attitude.yaw_std)
                         estimates[i][estimate.time_us] = np.array([*attitude.q_nb, *stds])
@@ -108,7 +106,9 @@ def main() -> None:
     )
     with ProcessPoolExecutor(chosen.workers) as pool:
         rows = dict(zip(cases, pool.map(work, cases), strict=True))
-    print(f"{chosen.scenario}, {chosen.seeds} seeds from {chosen.first}, {' '.join(chosen.settings)}")
+    print(
+        f"{chosen.scenario}, {chosen.seeds} seeds from {chosen.first}, {' '.join(chosen.settings)}"
+    )
     print(
         f"{'faults':10} {'method':7} {'median':>7} {'worst':>7} {'tilt':>6} "
         f"{'e/s tilt':>8} {'e/s yaw':>8} {'NIS':>5}  heading RMS of each seed, deg"

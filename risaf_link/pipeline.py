@@ -20,7 +20,7 @@ from risaf_link.core.estimate import ArrayStatus, Estimate
 from risaf_link.core.fusion import FUSIONS, Epoch, Fusion, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import ArrayHealth
-from risaf_link.core.robust import Robust
+from risaf_link.core.kernel import Robust
 from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk

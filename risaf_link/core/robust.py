@@ -152,20 +152,8 @@ class Robust:
         return self._channels.bias.T.copy()
 
     def health(self) -> ArrayHealth:
-        """Judge the sensors as of the last epoch; of a sensor, its worst axis counts.
-
-        Dead: frozen, or for a second silent, or for a minute not trusted.
-        """
-        c = self._channels
-        reason = np.where(self._trusted, Reason.NONE, Reason.SETTLING).astype(np.int8)
-        reason[c.wandering > 0] = Reason.WANDERING
-        reason[c.rejected > BURST] = Reason.OUTLYING
-        reason[c.frozen > 0] = Reason.FROZEN
-        reason[c.silent > 0] = Reason.SILENT
-        worst = reason.max(axis=0)
-        dead = (c.frozen > 0) | (c.silent > SILENT_AFTER) | (c.out > DEAD_AFTER)
-        state = np.where(dead.any(axis=0), SensorState.DEAD, worst > Reason.NONE).astype(np.int8)
-        return ArrayHealth(state, worst, c.rejected.max(axis=0), self.relative_bias)
+        """Judge the sensors as of the last epoch; of a sensor, its worst axis counts."""
+        return judge(self._channels, self._trusted)
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
@@ -381,6 +369,23 @@ class Robust:
             self._channels.calm += self._parameters.hold_time
             self._channels.out[:] = 0.0
         self._trusted = self._channels.calm >= self._parameters.hold_time
+
+
+def judge(channels: Channels, trusted: Bools) -> ArrayHealth:
+    """Judge sensors by their channels; of a sensor, its worst axis counts.
+
+    Dead: frozen, or for a second silent, or for a minute not trusted.
+    """
+    c = channels
+    reason = np.where(trusted, Reason.NONE, Reason.SETTLING).astype(np.int8)
+    reason[c.wandering > 0] = Reason.WANDERING
+    reason[c.rejected > BURST] = Reason.OUTLYING
+    reason[c.frozen > 0] = Reason.FROZEN
+    reason[c.silent > 0] = Reason.SILENT
+    worst = reason.max(axis=0)
+    dead = (c.frozen > 0) | (c.silent > SILENT_AFTER) | (c.out > DEAD_AFTER)
+    state = np.where(dead.any(axis=0), SensorState.DEAD, worst > Reason.NONE).astype(np.int8)
+    return ArrayHealth(state, worst, c.rejected.max(axis=0), c.bias.T.copy())
 
 
 def _jury(trusted: Bools, changing: Bools, valid: Bools) -> Bools:
