@@ -22,12 +22,13 @@ Sensors may sample by clocks of their own. At an angular acceleration a, one tha
 off by t a: in violent motion far more than its noise, and along one direction. So each epoch is
 weighed by the inverse of its own covariance, C = S / (NU + n - 1), S = NU s^2 I + sum d d^T: what
 its residuals say, and isotropic noise s^2 as if `NU` sensors had said so; 1/s^2 is the mean
-eigenvalue of all inverses. This is expectation maximisation for Student's t, as in Lange, Little and Taylor, "Robust
-Statistical Modeling Using the t Distribution", JASA 84, 1989, with the readings of an epoch sharing
-one weight, a matrix. Along a such an epoch says little, and across it all it can.
+eigenvalue of all inverses. This is expectation maximisation for Student's t, as in Lange, Little
+and Taylor, "Robust Statistical Modeling Using the t Distribution", JASA 84, 1989, with the readings
+of an epoch sharing one weight, a matrix. Such an epoch says little along a, and all it can across.
 
-A reading beyond `GATE` spreads of its epoch is left out. A sensor of which too little is left to
-know it by `ENOUGH` is not calibrated; if that is so of the typical one, the motion was not enough.
+A reading beyond `GATE` spreads of its epoch is left out. A sensor of which less than `USABLE` is
+left, or too little to know it by `ENOUGH`, is not calibrated: it gets the mounting of those that it
+sits like, and no more. If the typical one is not known by `ENOUGH`, the motion was too little.
 
 How certain it is
 -----------------
@@ -57,6 +58,7 @@ from risaf_link.core.rotation import Floats, nearest_rotation, quaternion_from_m
 
 FEWEST = 3  # sensors: of two, none can tell which is wrong
 ENOUGH = 0.005  # of scale, and rad: an axis that is known worse has not been turned about enough
+USABLE = 0.5  # share of its readings that makes a sensor worth calibrating
 GATE = 6.0  # spreads; wide, since the rest is weighed
 NU = 5.0  # sensors that the prior of an epoch's covariance counts as
 PRIOR = 0.3  # of scale, and rad: how far a sensor may be off; matters where readings tell nothing
@@ -95,7 +97,7 @@ class Calibrated:
     mounting_std: Floats  # (n, 3) rad, about the body's axes
     turn: Floats  # (n,) rad, between R and the mounting of all that are mounted alike
     axis_std: Floats  # (n, 3) the worst of what a turn about a body axis is read as
-    used: Floats  # (n,) share of its readings in motion
+    used: Floats  # (n,) share of its readings, of epochs in motion that half of the sensors read
     before: Disagreement  # with nothing but the nominal mounting put right
     after: Disagreement  # of each half of the motion, calibrated by the other
     rest: float  # s; 0: the biases are relative
@@ -105,8 +107,7 @@ class Calibrated:
     @property
     def determined(self) -> Bools:
         """Which sensors are calibrated, shape (n,)."""
-        known: Bools = (self.axis_std <= ENOUGH).all(axis=1)
-        return known
+        return _determined(self.axis_std, self.used)
 
     @property
     def typical_std(self) -> Floats:
@@ -133,20 +134,23 @@ def calibrate(readings: Readings, given: Floats | None = None) -> Calibrated:
     Raises
     ------
     ValueError
-        If there are less than `FEWEST` sensors, or never so many valid readings at once.
+        If there are less than `FEWEST` sensors, or never so many valid readings at once, or no
+        motion.
     """
     n = readings.rates_s.shape[1]
     if n < FEWEST:
         raise ValueError(f"found {n} gyros, expected {FEWEST} or more")
-    rates = np.where(
-        np.isfinite(readings.rates_s).all(axis=2)[:, :, None], readings.rates_s, np.nan
-    )
-    enough = np.isfinite(rates[:, :, 0]).sum(axis=1) >= FEWEST
+    valid = _whole(readings.rates_s)
+    rates = np.where(valid[:, :, None], readings.rates_s, np.nan)
+    enough = valid.sum(axis=1) >= FEWEST
     if not enough.any():
         raise ValueError(f"found no epoch with {FEWEST} valid readings")
     readings = Readings(readings.time_s[enough], rates[enough])
     mounting = find_mounting(readings, given)
-    fit = _iterate(_started(readings, mounting, find_rest(readings, mounting)))
+    rest = find_rest(readings, mounting)
+    if rest.epochs.all():
+        raise ValueError("found the array at rest throughout, expected turns about all axes")
+    fit = _iterate(_started(readings, mounting, rest))
     return _told(readings, fit, _covariance(fit), *_judge(fit))
 
 
@@ -187,9 +191,14 @@ class _Equations:
 def _started(readings: Readings, mounting: Mounting, rest: Rest) -> _Fit:
     zero = np.where(np.isfinite(rest.bias), rest.bias, mounting.zero)
     rates = readings.rates_s[~rest.epochs] - zero
-    valid = np.isfinite(rates[:, :, 0])
+    valid = _whole(rates)
     rates = np.where(valid[:, :, None], rates, 0.0)
     return _Fit(mounting, rest, zero, rates, valid, valid, mounting.matrix, np.zeros_like(zero))
+
+
+def _whole(rates: Floats) -> Bools:
+    """Which sensors have a reading on all axes, shape (k, n)."""
+    return np.asarray(np.isfinite(rates).all(axis=2))
 
 
 def _iterate(fit: _Fit, first: int = 0) -> _Fit:
@@ -210,8 +219,8 @@ def _gate(fit: _Fit) -> Bools:
     spread = MAD_TO_STD * median(distance)
     limit = GATE * np.maximum(spread, np.median(spread, axis=0))
     with np.errstate(invalid="ignore"):
-        used: Bools = (distance <= limit[:, None]).all(axis=2)
-    return used & (used.sum(axis=1) >= FEWEST)[:, None]
+        used = np.asarray((distance <= limit[:, None]).all(axis=2))
+    return np.asarray(used & (used.sum(axis=1) >= FEWEST)[:, None])
 
 
 def _equations(fit: _Fit) -> _Equations:
@@ -240,7 +249,8 @@ def _equations(fit: _Fit) -> _Equations:
 
 def _squares(weight: Floats, unknowns: Floats) -> Floats:
     """Of each epoch, what it adds to the normal matrix of a sensor; shape (k, 144)."""
-    return np.einsum("kij,kc,kd->kicjd", weight, unknowns, unknowns).reshape(-1, 144)
+    squares: Floats = np.einsum("kij,kc,kd->kicjd", weight, unknowns, unknowns)
+    return squares.reshape(-1, 144)
 
 
 def _prior(fit: _Fit) -> Floats:
@@ -248,7 +258,7 @@ def _prior(fit: _Fit) -> Floats:
     information = np.full((len(fit.zero), 3, 4), PRIOR**-2)
     if fit.rest.epochs.any():
         variance = np.maximum(fit.rest.variance.mean(axis=1), LEAST)
-        information[:, :, 3] = np.where(np.isfinite(variance), 1.0 / variance, 0.0)[:, None]
+        information[:, :, 3] = np.where(np.isfinite(variance), 1.0 / variance, PRIOR**-2)[:, None]
     return information.reshape(-1, 12)
 
 
@@ -298,7 +308,8 @@ def _covariance(fit: _Fit) -> Floats:
     weighted = equations.residual @ equations.weight
     count = np.maximum(fit.used.sum(axis=0), 1)
     white = (weighted * equations.residual).sum(axis=(0, 2)) / (3.0 * count)
-    found, expected = np.zeros((2, len(count)))
+    found: Floats = np.zeros(len(count))
+    expected: Floats = np.zeros(len(count))
     for block in _blocks(fit):
         rate = equations.rate[block]
         score = (weighted[block].transpose(1, 2, 0) @ rate).reshape(-1, 12)
@@ -306,10 +317,11 @@ def _covariance(fit: _Fit) -> Floats:
         normal = (fit.used[block].astype(float).T @ squares).reshape(-1, 12, 12)
         share = covariance @ normal
         found += np.einsum("ni,nij,nj->n", score, covariance, score)
-        expected += np.trace(share - share @ share, axis1=1, axis2=2)
+        expected = expected + np.trace(share - share @ share, axis1=1, axis2=2)
     sure = (white > 0.0) & (expected > 0.0)
-    colour = np.median((found[sure] / expected[sure]) / white[sure]) if sure.any() else 1.0
-    excess = white * max(1.0, float(colour)) / _answer(fit, equations) ** 2
+    ratio = found[sure] / expected[sure] / white[sure]
+    colour = max(1.0, float(np.median(ratio))) if sure.any() else 1.0
+    excess = white * colour / _answer(fit, equations) ** 2
     scaled: Floats = covariance * np.where(white > 0.0, excess, 1.0)[:, None, None]
     return scaled
 
@@ -334,8 +346,8 @@ def _judge(fit: _Fit) -> tuple[Disagreement, Disagreement]:
     blocks = _blocks(fit)
     for parity in (0, 1):
         judged = np.logical_or.reduce(blocks[parity::2], initial=False)
-        if not judged.any() or judged.all():
-            judged = np.ones_like(judged)  # one block: there is no other half
+        if len(blocks) < 2:
+            judged = np.ones(len(fit.used), dtype=bool)  # there is no other half
         learnt = fit if judged.all() else _iterate(_during(fit, ~judged), first=SETTLED)
         half = replace(_during(fit, judged), matrix=learnt.matrix, offset=learnt.offset)
         after[judged] = half.rates_b
@@ -373,14 +385,16 @@ def _told(
     of_matrix = by_element[:, :, :3, :, :3].reshape(n, 9, 9)
     deviation = np.sqrt(np.maximum(of_matrix.diagonal(axis1=1, axis2=2), 0.0))
     axis_std = deviation.reshape(n, 3, 3).max(axis=1)
-    known = (axis_std <= ENOUGH).all(axis=1)
+    shared = fit.used[fit.used.mean(axis=1) >= 0.5]
+    used = shared.mean(axis=0) if len(shared) else fit.used.mean(axis=0)
+    known = _determined(axis_std, used)
     matrix = np.where(known[:, None, None], fit.matrix, fit.mounting.nominal)
     parts, parts_std = _split(matrix), _split_std(matrix, of_matrix)
     rotation = nearest_rotation(matrix)
-    bias, bias_std = _bias(fit, by_element[:, :, 3, :, 3])
+    bias, bias_std = _bias(fit, by_element, known)
     moving = ~fit.rest.epochs
-    rate = np.einsum("kn,kni->ki", fit.used, fit.rates_b)
-    rate /= np.maximum(fit.used.sum(axis=1), 1)[:, None]
+    count = np.maximum(fit.used.sum(axis=1), 1)
+    rate = np.einsum("kn,kni->ki", fit.used, fit.rates_b) / count[:, None]
     cosine = (np.einsum("nij,nij->n", rotation, fit.mounting.nominal) - 1.0) / 2.0
     return Calibrated(
         bias,
@@ -393,7 +407,7 @@ def _told(
         parts_std[:, 9:],
         np.arccos(np.clip(cosine, -1.0, 1.0)),
         axis_std,
-        fit.used.mean(axis=0),
+        used,
         before,
         after,
         _seconds(readings.time_s, fit.rest.epochs),
@@ -402,16 +416,26 @@ def _told(
     )
 
 
-def _bias(fit: _Fit, covariance: Floats) -> tuple[Floats, Floats]:
+def _determined(axis_std: Floats, used: Floats) -> Bools:
+    return np.asarray((axis_std <= ENOUGH).all(axis=1) & (used >= USABLE))
+
+
+def _bias(fit: _Fit, covariance: Floats, known: Bools) -> tuple[Floats, Floats]:
     """Bias at rest, or relative, and its standard deviation; 0 where nothing is known."""
     if fit.rest.epochs.any():
         bias, variance = fit.rest.bias, fit.rest.variance
     else:
         inverse = np.linalg.inv(fit.matrix)
-        bias = fit.zero - np.einsum("nij,nj->ni", inverse, fit.offset)
-        variance = np.einsum("nij,njk,nik->ni", inverse, covariance, inverse)
-    known = np.isfinite(bias) & np.isfinite(variance)
-    return np.where(known, bias, 0.0), np.where(known, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+        bias_b = np.einsum("nij,nj->ni", fit.matrix, fit.zero) - fit.offset
+        common_b = bias_b[known if known.any() else ~known].mean(axis=0)
+        bias = np.einsum("nij,nj->ni", inverse, bias_b - common_b)
+        bias[~known] = np.nan
+        at = np.append(-common_b, 1.0)  # the rate that the bias would be a reading of, and 1
+        of_bias_b = np.einsum("c,nicjd,d->nij", at, covariance, at)
+        variance = np.einsum("nij,njk,nik->ni", inverse, of_bias_b, inverse)
+    told = np.isfinite(bias) & np.isfinite(variance)
+    deviation = np.sqrt(np.where(told, np.maximum(variance, 0.0), np.nan))
+    return np.where(told, bias, 0.0), deviation
 
 
 def _split(matrix: Floats, about: Floats | None = None) -> Floats:

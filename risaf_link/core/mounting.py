@@ -115,8 +115,9 @@ def find_rest(readings: Readings, mounting: Mounting) -> Rest:
     count = np.bincount(window)
     mean = _by_window(common, window) / count[:, None]
     variance = _by_window((common - mean[window]) ** 2, window) / count[:, None]
-    difference = np.diff(rates - common[:, None], axis=0)
-    noise = np.nanmedian(np.abs(difference), axis=(0, 1)) * MAD_TO_STD / np.sqrt(2.0)
+    difference: Floats = np.diff(rates - common[:, None], axis=0)
+    (typical,) = quantiles(np.abs(difference).reshape(-1, 3).T, (0.5,))
+    noise = MAD_TO_STD / np.sqrt(2.0) * typical
     level = np.einsum("nij,nj->ni", mounting.matrix, mounting.zero)
     spread = np.nanmedian(np.abs(level - np.nanmedian(level, axis=0)), axis=0) * MAD_TO_STD
     quiet = (variance <= LIMIT * noise**2 / n * np.pi / 2 + SHAKING**2).all(axis=1)
@@ -144,7 +145,7 @@ def median(rates: Floats) -> Floats:
 def _zero(readings: Readings) -> Floats:
     """Mean reading of each sensor in the quietest window, shape (n, 3)."""
     window, rates = readings.windows, readings.rates_s
-    valid = np.isfinite(rates)
+    valid: Bools = np.asarray(np.isfinite(rates))
     count = _by_window(valid, window)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = _by_window(np.where(valid, rates, 0.0), window) / count
@@ -187,7 +188,8 @@ def _alike(rotation: Floats) -> Bools:
 def _nominal(rotation: Floats, alike: Bools, axes: Bools) -> Floats:
     """Mean rotation of the sound sensors that are mounted as each one is; the axes' is none."""
     mean = np.tensordot(alike.astype(float), rotation, axes=1)
-    nominal = nearest_rotation(np.where(alike.any(axis=1)[:, None, None], mean, rotation))
+    in_group = np.asarray(alike.any(axis=1))
+    nominal = nearest_rotation(np.where(in_group[:, None, None], mean, rotation))
     nominal[axes] = np.eye(3)
     return nominal
 
