@@ -24,7 +24,7 @@ class Array:
     seed: int
     sensors: int = 8
     rest: float = 8.0
-    moving: float = 20.0
+    moving: float = 12.0
     amplitude: tuple[float, float, float] = (40.0, 40.0, 40.0)  # deg/s RMS
     noise: float = 0.2  # deg/s
     late: float = 0.0  # s, most that a sensor samples early or late
@@ -110,19 +110,19 @@ EVEN, ALL = np.arange(0, 8, 2), np.arange(8)
 )
 def test_errors_are_as_large_as_the_deviations_say(case):
     squares = []
-    for seed in range(12):
+    for seed in range(8):
         array = Array(seed, **case).mount(UPSIDE_DOWN, slice(1, None, 2))
         found = calibrate(Readings(array.time_s, array.read()))
         assert found.determined.all()
         squares.append(scores(found, array.truth(EVEN)) ** 2)
-    # 12 seeds of 8 sensors of 12 numbers, not quite independent: 1 within a quarter, in RMS
+    # 8 seeds of 8 sensors of 12 numbers, not quite independent: 1 within a quarter, in RMS
     assert 0.75 < np.sqrt(np.mean(squares)) < 1.25
     assert np.max(squares) < 5.5**2
 
 
 def test_bias_is_the_mean_at_rest_within_its_deviation():
     squares = []
-    for seed in range(12):
+    for seed in range(8):
         array = Array(seed, moving=6.0)
         found = calibrate(Readings(array.time_s, array.read()))
         assert found.rest == pytest.approx(array.rest, abs=1.0)
@@ -147,7 +147,7 @@ def test_an_array_mounted_alike_keeps_its_axes_and_its_scale_on_the_average():
     np.testing.assert_allclose(matrices(found).mean(axis=0), np.eye(3), atol=1e-4)
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1), st.integers(5, 12))
 def test_any_mounting_is_found_and_most_sensors_say_what_the_axes_are(seed, sensors):
     array = Array(seed, sensors=sensors, moving=8.0)
@@ -185,7 +185,7 @@ def test_dead_frozen_and_spiky_sensors_neither_spoil_the_others_nor_pass_for_goo
     one, true = matrices(found)[sound], (array.matrix @ array.mounting)[sound]
     relative = np.linalg.inv(one[0]) @ one - np.linalg.inv(true[0]) @ true
     assert np.abs(relative).max() < 6 * found.axis_std[sound].max()
-    np.testing.assert_array_equal(matrices(found)[1], np.eye(3))
+    np.testing.assert_allclose(matrices(found)[1], np.eye(3), atol=1e-12)
 
 
 def test_what_it_gains_is_judged_where_it_did_not_learn():

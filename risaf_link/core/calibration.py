@@ -308,20 +308,19 @@ def _covariance(fit: _Fit) -> Floats:
     weighted = equations.residual @ equations.weight
     count = np.maximum(fit.used.sum(axis=0), 1)
     white = (weighted * equations.residual).sum(axis=(0, 2)) / (3.0 * count)
-    found: Floats = np.zeros(len(count))
-    expected: Floats = np.zeros(len(count))
+    found = expected = np.zeros(len(count))
     for block in _blocks(fit):
         rate = equations.rate[block]
         score = (weighted[block].transpose(1, 2, 0) @ rate).reshape(-1, 12)
         squares = _squares(equations.weight[block], rate)
         normal = (fit.used[block].astype(float).T @ squares).reshape(-1, 12, 12)
         share = covariance @ normal
-        found += np.einsum("ni,nij,nj->n", score, covariance, score)
+        found = found + np.einsum("ni,nij,nj->n", score, covariance, score)
         expected = expected + np.trace(share - share @ share, axis1=1, axis2=2)
     sure = (white > 0.0) & (expected > 0.0)
     ratio = found[sure] / expected[sure] / white[sure]
     colour = max(1.0, float(np.median(ratio))) if sure.any() else 1.0
-    excess = white * colour / _answer(fit, equations) ** 2
+    excess = np.asarray(white * colour / _answer(fit, equations) ** 2)
     scaled: Floats = covariance * np.where(white > 0.0, excess, 1.0)[:, None, None]
     return scaled
 
