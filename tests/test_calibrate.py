@@ -2,7 +2,7 @@
 
 import json
 
-import board
+import mimu4444
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -25,7 +25,7 @@ def call(*arguments):
 def turned(seconds=12.0, amplitude=(60.0, 60.0, 60.0), sensors=6, seed=1):
     """Counts of an array that rests for five seconds and is then turned about, (k, n, 3)."""
     random = np.random.default_rng(seed)
-    time_s = np.arange(0, 5 + seconds, board.PERIOD_US / 1e6)
+    time_s = np.arange(0, 5 + seconds, mimu4444.PERIOD_US / 1e6)
     moving_s = np.maximum(time_s - 5.0, 0.0)
     swing = [np.sin(2 * np.pi * f * moving_s) for f in (0.4, 0.7, 1.1)]
     rate = np.radians(amplitude) * np.stack(swing, axis=1)
@@ -33,7 +33,7 @@ def turned(seconds=12.0, amplitude=(60.0, 60.0, 60.0), sensors=6, seed=1):
     bias = np.radians(random.standard_normal((sensors, 3)))
     noise = np.radians(0.1) * random.standard_normal((len(time_s), sensors, 3))
     read = np.einsum("nij,kj->kni", backward, rate) + bias + noise
-    return np.rint(read / board.SCALE).astype(int)
+    return np.rint(read / mimu4444.SCALE).astype(int)
 
 
 def corrected(path, rates_s):
@@ -44,8 +44,10 @@ def corrected(path, rates_s):
 
 
 def apart(rates_b):
-    """Standard deviation between sensors, rad/s: of all, and across the direction in which those
-    of an epoch differ most, of all and of the typical epoch; where all are valid.
+    """Standard deviation between sensors, rad/s, where all are valid.
+
+    Of all axes; across the direction in which those of an epoch differ most; and that of the
+    typical epoch.
     """
     rates_b = rates_b[np.isfinite(rates_b).all(axis=(1, 2))]
     residual = rates_b - rates_b.mean(axis=1, keepdims=True)
@@ -57,13 +59,13 @@ def apart(rates_b):
 
 
 def test_the_file_makes_the_sensors_agree_on_another_log(tmp_path):
-    log = board.write_log(tmp_path / "turned.tlog", turned())
+    log = mimu4444.write_log(tmp_path / "turned.tlog", turned())
     result = call("calibrate", log, "--out", tmp_path / "array.yaml", "--json")
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert found["calibrated"] == found["sensors"] == 6
     assert found["rest_s"] == pytest.approx(5.0, abs=1.0)
-    raw = turned() * board.SCALE  # the same array
+    raw = turned() * mimu4444.SCALE  # the same array
     before, after = apart(raw)[0], apart(corrected(tmp_path / "array.yaml", raw))[0]
     assert np.degrees(before) > 1.0
     assert np.degrees(after) == pytest.approx(0.1, rel=0.1)
@@ -71,14 +73,14 @@ def test_the_file_makes_the_sensors_agree_on_another_log(tmp_path):
 
 
 def test_replay_takes_the_file(tmp_path):
-    log = board.write_log(tmp_path / "turned.tlog", turned())
+    log = mimu4444.write_log(tmp_path / "turned.tlog", turned())
     assert call("calibrate", log, "--out", tmp_path / "array.yaml").exit_code == 0
     result = call("replay", log, "--set", f"array.calibration={tmp_path / 'array.yaml'}", "--json")
     assert json.loads(result.stdout)["epochs"] == len(turned())
 
 
 def test_it_says_what_was_found_of_every_sensor(tmp_path):
-    log = board.write_log(tmp_path / "turned.tlog", turned())
+    log = mimu4444.write_log(tmp_path / "turned.tlog", turned())
     result = call("calibrate", log, "--out", tmp_path / "array.yaml")
     rows = [line.split() for line in result.stdout.splitlines()]
     assert [row[0] for row in rows if row and row[0].isdecimal()][:6] == list("012345")
@@ -90,7 +92,7 @@ def test_it_says_what_was_found_of_every_sensor(tmp_path):
 def test_a_log_that_excites_too_little_is_refused_by_its_axis(tmp_path, axis):
     amplitude = [60.0, 60.0, 60.0]
     amplitude[axis] = 0.0
-    log = board.write_log(tmp_path / "flat.tlog", turned(amplitude=amplitude))
+    log = mimu4444.write_log(tmp_path / "flat.tlog", turned(amplitude=amplitude))
     result = call("calibrate", log, "--out", tmp_path / "array.yaml")
     assert result.exit_code == 3
     assert result.stderr.count("\n") == 1
@@ -101,7 +103,7 @@ def test_a_log_that_excites_too_little_is_refused_by_its_axis(tmp_path, axis):
 def test_a_log_without_samples_or_of_rest_alone_is_refused(tmp_path):
     empty = tmp_path / "empty.tlog"
     empty.write_bytes(b"")
-    still = board.write_log(tmp_path / "still.tlog", turned(seconds=0.0))
+    still = mimu4444.write_log(tmp_path / "still.tlog", turned(seconds=0.0))
     for log, reason in ((empty, "no gyro samples"), (still, "at rest throughout")):
         result = call("calibrate", log, "--out", tmp_path / "array.yaml")
         assert result.exit_code == 3
@@ -109,7 +111,7 @@ def test_a_log_without_samples_or_of_rest_alone_is_refused(tmp_path):
 
 
 def test_a_file_that_cannot_be_written_is_said(tmp_path):
-    log = board.write_log(tmp_path / "turned.tlog", turned())
+    log = mimu4444.write_log(tmp_path / "turned.tlog", turned())
     result = call("calibrate", log, "--out", tmp_path / "nowhere" / "array.yaml")
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
@@ -121,7 +123,7 @@ def test_mountings_of_a_calibration_that_is_there_are_kept(tmp_path):
     (tmp_path / "known.yaml").write_text("\n".join(["gyros:", *mountings]))
     read = turned()
     read[:, 1::2] *= [1, -1, -1]
-    log = board.write_log(tmp_path / "turned.tlog", read)
+    log = mimu4444.write_log(tmp_path / "turned.tlog", read)
     known = f"array.calibration={tmp_path / 'known.yaml'}"
     result = call("calibrate", log, "--out", tmp_path / "new.yaml", "--set", known, "--json")
     assert result.exit_code == 0, result.output
@@ -131,12 +133,12 @@ def test_mountings_of_a_calibration_that_is_there_are_kept(tmp_path):
 
 
 def test_the_real_board_calibrated_on_half_of_its_motion_agrees_in_the_other(tmp_path):
-    read = board.counts("exp_5_last")
-    log = board.write_log(tmp_path / "first.tlog", read[:HALF])
+    read = mimu4444.counts("exp_5_last")
+    log = mimu4444.write_log(tmp_path / "first.tlog", read[:HALF])
     result = call("calibrate", log, "--out", tmp_path / "board.yaml", "--json")
     assert result.exit_code == 0, result.output
-    others = board.rates("exp_5_last")[HALF:3600]  # without the rest at the end
-    mounted = np.einsum("nij,knj->kni", board.NOMINAL, others)
+    others = mimu4444.rates("exp_5_last")[HALF:3600]  # without the rest at the end
+    mounted = np.einsum("nij,knj->kni", mimu4444.NOMINAL, others)
     plain, across, typical = apart(mounted)
     after_plain, after_across, after_typical = apart(corrected(tmp_path / "board.yaml", others))
     assert 10.0 < np.degrees(plain) < 28.0
@@ -147,12 +149,12 @@ def test_the_real_board_calibrated_on_half_of_its_motion_agrees_in_the_other(tmp
     assert after_plain < 0.8 * plain
     found = [gyro["mounting"] for gyro in json.loads(result.stdout)["gyros"]]
     rotations = matrix_from_quaternion(np.array(found))
-    assert np.abs(rotations - board.NOMINAL).max() < 0.02
+    assert np.abs(rotations - mimu4444.NOMINAL).max() < 0.02
 
 
 def test_two_recordings_of_the_board_tell_the_same_scale():
-    violent = calibrate(Readings(np.arange(3750) / 62.5, board.rates("exp_5_last")))
-    gentle = calibrate(Readings(np.arange(3750) / 62.5, board.rates("exp_6_first")))
+    violent = calibrate(Readings(np.arange(3750) / 62.5, mimu4444.rates("exp_5_last")))
+    gentle = calibrate(Readings(np.arange(3750) / 62.5, mimu4444.rates("exp_6_first")))
     assert gentle.rest == pytest.approx(57.0, abs=1.0)
     error = (gentle.scale - violent.scale) / np.hypot(gentle.scale_std, violent.scale_std)
     # Scale of these sensors is not quite linear between 30 and 900 deg/s.

@@ -321,8 +321,7 @@ def _covariance(fit: _Fit) -> Floats:
     ratio = found[sure] / expected[sure] / white[sure]
     colour = max(1.0, float(np.median(ratio))) if sure.any() else 1.0
     excess = np.asarray(white * colour / _answer(fit, equations) ** 2)
-    scaled: Floats = covariance * np.where(white > 0.0, excess, 1.0)[:, None, None]
-    return scaled
+    return np.asarray(covariance * np.where(white > 0.0, excess, 1.0)[:, None, None])
 
 
 def _answer(fit: _Fit, equations: _Equations) -> Floats:
