@@ -22,7 +22,7 @@ import mimu4444
 from risaf_link.core.calibration import Calibrated, calibrate
 from risaf_link.core.fusion import FUSIONS, Epoch, FusionParameters
 from risaf_link.core.mounting import Readings
-from risaf_link.core.robust import Robust, RobustParameters
+from risaf_link.core.robust import Robust
 from risaf_link.core.rotation import matrix_from_quaternion
 
 PERIOD = mimu4444.PERIOD_US / 1e6  # s
@@ -43,9 +43,7 @@ def applied(found: Calibrated, rates_s: np.ndarray) -> np.ndarray:
 
 def fused(method: str, rates_b: np.ndarray) -> np.ndarray:
     """The array as one gyro, (k, 3)."""
-    fusion = (
-        Robust(RobustParameters()) if method == "robust" else FUSIONS[method](FusionParameters())
-    )
+    fusion = {**FUSIONS, "robust": Robust}[method](FusionParameters())
     empty = np.zeros((0, 3))
     return np.array(
         [
