@@ -27,6 +27,18 @@ class RobustParameters:
     prior: float
     mad_factors: list[float]
 
+class Risaf:
+    def __init__(
+        self,
+        alpha: float,
+        lower_quantile: float,
+        upper_quantile: float,
+        gyro_noise: float,
+        bias_walk: float,
+    ) -> None: ...
+    def fuse(self, dt: float, readings: Floats) -> tuple[Floats, NDArray[np.int64], int]: ...
+    def relative_bias(self) -> Floats: ...
+
 class Robust:
     def __init__(self, parameters: RobustParameters) -> None: ...
     def fuse(self, dt: float, readings: Floats) -> tuple[Floats, NDArray[np.int64], int]: ...

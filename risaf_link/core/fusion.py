@@ -181,9 +181,6 @@ class Median:
         return self._silence.health()
 
 
-FUSIONS: dict[str, type[Risaf | Mean | Median]] = {"risaf": Risaf, "mean": Mean, "median": Median}
-
-
 def quantiles(values: Floats, shares: tuple[float, ...]) -> Floats:
     """Quantiles of the valid values of each row, interpolated linearly between order statistics.
 

@@ -3,6 +3,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include "risaf.hpp"
 #include "robust.hpp"
 
 namespace nb = nanobind;
@@ -20,9 +21,10 @@ Array<T> owned(T* values, std::initializer_list<std::size_t> shape) {
   return Array<T>(values, shape, owner);
 }
 
-nb::tuple fuse(risaf::Robust& robust, double dt, const Readings& readings) {
+template <typename Fusion>
+nb::tuple fuse(Fusion& fusion, double dt, const Readings& readings) {
   risaf::FusedAxis fused[3];
-  const std::int64_t valid = robust.fuse(dt, readings.data(), readings.shape(0), fused);
+  const std::int64_t valid = fusion.fuse(dt, readings.data(), readings.shape(0), fused);
   auto* values = new double[12];
   auto* active = new std::int64_t[3];
   for (std::size_t k = 0; k < 3; ++k) {
@@ -68,6 +70,16 @@ nb::dict all_channels(const risaf::Robust& robust) {
   return all;
 }
 
+Array<double> relative_bias(const risaf::Risaf& fusion) {
+  const std::size_t n = fusion.sensors();
+  auto* values = new double[3 * n];
+  for (std::size_t k = 0; k < 3; ++k) {
+    const auto& bias = fusion.relative_bias(k);
+    std::copy(bias.begin(), bias.end(), values + k * n);
+  }
+  return owned(values, {3, n});
+}
+
 }  // namespace
 
 NB_MODULE(_kernel, m) {
@@ -99,9 +111,15 @@ NB_MODULE(_kernel, m) {
   field("prior", &risaf::RobustParameters::prior);
   parameters.def_rw("mad_factors", &risaf::RobustParameters::mad_factors);
 
+  nb::class_<risaf::Risaf>(m, "Risaf")
+      .def(nb::init<double, double, double, double, double>(), "alpha"_a, "lower_quantile"_a,
+           "upper_quantile"_a, "gyro_noise"_a, "bias_walk"_a)
+      .def("fuse", &fuse<risaf::Risaf>, "dt"_a, "readings"_a)
+      .def("relative_bias", &relative_bias);
+
   nb::class_<risaf::Robust>(m, "Robust")
       .def(nb::init<risaf::RobustParameters>())
-      .def("fuse", &fuse, "dt"_a, "readings"_a)
+      .def("fuse", &fuse<risaf::Robust>, "dt"_a, "readings"_a)
       .def("channels", &all_channels)
       .def("trusted", [](const risaf::Robust& robust) {
         return channels(robust, &risaf::Robust::Axis::trusted);

@@ -6,15 +6,12 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <limits>
 #include <vector>
 
+#include "fused.hpp"
 #include "select.hpp"
 
 namespace risaf {
-
-constexpr double NaN = std::numeric_limits<double>::quiet_NaN();
-constexpr double INFINITE = std::numeric_limits<double>::infinity();
 
 struct RobustParameters {
   double gate, bias_time, hold_time, resolution, scale_error, gyro_noise, bias_walk;
@@ -22,12 +19,6 @@ struct RobustParameters {
   double limit, longest, watch_time, burst_time, burst, swell, noise_time, spread_time;
   double frozen_after, silent_after, relearn, tiny, least_white, prior;
   std::vector<double> mad_factors;
-};
-
-// One axis of the rate of an array; what `FusedRate` holds.
-struct FusedAxis {
-  double rate, variance, noise, bias_walk;
-  std::int64_t active;
 };
 
 class Robust {
