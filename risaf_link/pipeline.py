@@ -87,7 +87,7 @@ class Pipeline:
         self._filter: Eskf | PaperFilter
         self._aiding: Aiding | None = None
         if p.attitude.filter == "eskf":
-            self._filter, self._aiding = Eskf(p.attitude), Aiding(p.attitude)
+            self._filter, self._aiding = Eskf(p.attitude), Aiding()
         else:
             self._filter = PaperFilter(p.attitude)
         self._heading = p.heading

@@ -29,7 +29,7 @@ from msgspec.structs import replace as set_parameters
 
 from risaf_link.core.aiding import Aiding
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
-from risaf_link.core.eskf import ATTITUDE, Eskf, Gravity, Outcome
+from risaf_link.core.eskf import ATTITUDE, STATES, Eskf, Gravity, Outcome, drive
 from risaf_link.core.rotation import (
     euler_from_quaternion,
     matrix_from_quaternion,
@@ -114,6 +114,30 @@ def test_without_accelerometer_the_tilt_is_as_unknown_as_the_bias_makes_it():
     assert not state.aligned
 
 
+def test_an_error_of_scale_grows_with_the_angle_turned_and_goes_with_turning_back():
+    known = set_parameters(DEFAULTS, initial_bias_std=1e-9, turn_error=0.0)
+    estimator = aligned_filter(std=1e-3, parameters=known)
+    run(estimator, 10.0, (0.0, 0.0, 2.0))
+    assert estimator.state(0).yaw_std == pytest.approx(20.0 * DEFAULTS.scale_std, rel=0.02)
+    run(estimator, 10.0, (0.0, 0.0, -2.0))
+    assert estimator.state(0).yaw_std < 0.002
+
+
+def test_an_error_of_scale_is_learnt_from_headings():
+    """A gyro that shows 0.5 % too much: turns and stops under GPS, then three turns without."""
+    estimator = aligned_filter(std=0.02)
+    truth, errors = 0.0, []
+    for step in range(12000):
+        rate = 2.0 if step >= 11000 else 1.0 if step % 2000 < 1000 else 0.0
+        truth = wrap(truth + rate * DT)
+        estimator.predict(fused([0.0, 0.0, 1.005 * rate]), DT)
+        if step < 11000 and step % 20 == 0:
+            estimator.correct_heading(truth, 0.02**2, 0.0, GATE)
+        elif step >= 11000:
+            errors.append(wrap(estimator.state(0).euler[2] - truth))
+    assert np.abs(errors).max() < 0.3 * 0.005 * 20.0
+
+
 def test_an_array_of_many_sensors_wanders_less():
     known = set_parameters(DEFAULTS, initial_bias_std=1e-9, initial_tilt_std=1e-9)
     tilts = []
@@ -133,7 +157,7 @@ def test_an_array_of_many_sensors_wanders_less():
 def test_the_tilt_is_that_of_gravity_from_the_start(roll, pitch):
     truth = quaternion_from_euler(math.radians(roll), math.radians(pitch), 0.0)
     force_b = -DOWN @ matrix_from_quaternion(truth)
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
+    estimator, aiding = Eskf(DEFAULTS), Aiding()
     for _ in range(70):
         estimator.predict(fused(np.zeros(3)), DT)
         aiding.take(estimator, fused(np.zeros(3)), force_b, DT)
@@ -293,7 +317,7 @@ def test_the_derivative_of_yaw_is_that_of_a_difference(tilt):
     estimator = aligned_filter(std=0.01)
     estimator._correction = tuple(quaternion_from_euler(0.4, tilt, 1.0))
     for axis in range(3):
-        estimator._covariance = np.zeros((6, 6))
+        estimator._covariance = np.zeros((STATES, STATES))
         estimator._covariance[axis, axis] = 1e-6
         turned = quaternion_from_euler(*(1e-5 * np.eye(3)[axis]))
         matrix_nb = matrix_from_quaternion(turned) @ estimator.matrix
@@ -307,7 +331,7 @@ def test_the_derivative_of_yaw_is_that_of_a_difference(tilt):
 
 @pytest.mark.parametrize("spin", [0.0, 1.0, 5.0, 25.0])
 def test_two_degrees_of_tilt_are_gone_within_four_seconds_while_spinning(spin):
-    estimator, aiding = aligned_filter(), Aiding(DEFAULTS)
+    estimator, aiding = aligned_filter(), Aiding()
     truth = quaternion_from_euler(0.0, 0.0, 0.0)
     estimator._correction = tuple(quaternion_from_euler(math.radians(2.0), 0.0, 0.0))
     estimator._covariance[ATTITUDE, ATTITUDE] = np.eye(3) * 0.05**2
@@ -319,7 +343,7 @@ def test_two_degrees_of_tilt_are_gone_within_four_seconds_while_spinning(spin):
 
 def test_level_is_found_again_after_a_dropout_of_the_accelerometer():
     """PX4 issue 24299: 4 s at 8 deg/s and 1.25 g, then level; below 5 deg within 8 s."""
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
+    estimator, aiding = Eskf(DEFAULTS), Aiding()
 
     def go(seconds, rate_b, force_b):
         for _ in range(round(seconds / DT)):
@@ -368,7 +392,9 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
     estimator = Eskf(p)
     phases, speeds = generator.uniform(0, 6, 3), np.array([0.31, 0.47, 0.23])
     nees, nis = [], {"heading": [], "gravity": [], "rest": []}
-    lean = generator.normal(size=2) * p.accel_bias_std
+    scale = generator.normal(size=(3, 3)) * p.scale_std
+    force_bias = generator.normal(size=3) * p.accel_bias_std
+    force_scale = generator.normal(size=(3, 3)) * p.scale_std
     for step in range(round(seconds / dt)):
         rate = np.array([0.3, 0.3, 0.5]) * np.sin(speeds * step * dt + phases)
         if 0.5 < step * dt / seconds < 0.6:
@@ -378,11 +404,14 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
         truth_nb = truth_nb @ matrix_from_quaternion(np.array([math.cos(angle / 2), *half]))
         bias = bias + generator.normal(size=3) * SENSORS.bias_walk * math.sqrt(dt)
         noise = generator.normal(size=3) * SENSORS.gyro_noise / math.sqrt(dt)
-        estimator.predict(fused(rate + bias + noise, dt=dt), dt)
+        estimator.predict(fused(rate + scale @ rate + bias + noise, dt=dt), dt)
         corrections = ()
-        wrong_n = np.array([*(lean + 0.3 * generator.normal(size=2)), 0.0])
-        gravity_n = estimator.matrix @ truth_nb.T @ (DOWN + wrong_n)
-        corrections += estimator.correct_gravity(Gravity(gravity_n, 0.09, 0.09))
+        shaken_n = -DOWN + 0.3 * generator.normal(size=3)
+        force_b = truth_nb.T @ shaken_n
+        force_b = force_b + force_scale @ force_b + force_bias
+        by_errors = drive(estimator.matrix, GRAVITY * estimator.up_b)
+        gravity = Gravity(-estimator.matrix @ force_b, 0.09, 0.09, by_errors=by_errors)
+        corrections += estimator.correct_gravity(gravity)
         if step % 2 == 0:
             heading = math.atan2(truth_nb[1, 0], truth_nb[0, 0]) + 0.03 * generator.normal()
             corrections += (estimator.correct_heading(wrap(heading), 0.03**2, 0.0, 6.0),)
@@ -401,7 +430,8 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
                     difference[1, 0] - difference[0, 1],
                 ]
             )
-            error = np.concatenate((angles / 2, bias - estimator.state(0).bias_b))
+            wrong = np.concatenate((bias, scale.ravel(), force_bias, force_scale.ravel()))
+            error = np.concatenate((angles / 2, wrong - estimator.known_errors))
             nees.append(error @ np.linalg.solve(estimator.covariance, error))
             if step % 200 == 199:
                 assert_sound(estimator)
@@ -430,10 +460,12 @@ def chi_square_bounds(degrees):
 def test_the_average_nees_over_50_seeds_is_within_its_bounds(honesty):
     """At every time within three standard deviations, in the mean over time within 95 %."""
     nees, _ = honesty
-    averages = nees.mean(axis=0) / 6
-    low, high = chi_square_bounds(6 * len(nees))  # as if all times were one: they are correlated
+    averages = nees.mean(axis=0) / STATES
+    low, high = chi_square_bounds(
+        STATES * len(nees)
+    )  # as if all times were one: they are correlated
     assert low < averages.mean() < high
-    assert np.abs(averages - 1.0).max() < 3.0 * math.sqrt(2.0 / (6 * len(nees)))
+    assert np.abs(averages - 1.0).max() < 3.0 * math.sqrt(2.0 / (STATES * len(nees)))
 
 
 @pytest.mark.parametrize("kind", ["heading", "gravity", "rest"])
@@ -482,7 +514,7 @@ def test_heading_in_an_outage_of_200_s_beats_px4(path):
     fixes = dict(
         zip(np.searchsorted(log["t_us"], log["gps"][:, 0]), log["gps"][:, 4:6], strict=True)
     )
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
+    estimator, aiding = Eskf(DEFAULTS), Aiding()
     estimator.set_latitude(math.radians(log["gps"][0, 1]))
     errors = []
     for k in range(len(gyro)):
