@@ -24,6 +24,7 @@ FUSION = FusionParameters(bias_walk=WALK)
 # The world of this test has nothing that sensors have in common but what the filter is told.
 ATTITUDE_PARAMETERS = AttitudeParameters(
     initial_bias_std=BIAS_STD / math.sqrt(SENSORS),
+    scale_std=1e-9,
     turn_error=0.0,
     common_noise=0.0,
     common_bias_walk=0.0,

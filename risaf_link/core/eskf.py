@@ -33,9 +33,8 @@ from risaf_link.core.rotation import Floats, wrap
 ATTITUDE = slice(0, 3)  # error: rotation vector, rad, NED
 BIAS = slice(3, 6)  # error of the fused rate's bias, rad/s, body
 SCALE = slice(6, 15)  # error of the matrix that the rate is too large by, row by row
-FORCE_BIAS = slice(15, 18)  # error of the accelerometers' bias, m/s^2, body
-FORCE_SCALE = slice(27, 27)  # error of the matrix that the force is too large by, row by row
-GYRO, ACCELEROMETER = slice(3, 15), slice(15, 27)  # all that makes their readings wrong
+GYRO = slice(3, 15)  # both
+ACCELEROMETER = slice(15, 27)  # the same of the accelerometers: m/s^2, body; 9 of the matrix
 STATES = 27
 DOWN = 2
 LEVEL, BIAS_AXES = np.arange(2), np.arange(3, 6)  # for diagonals
