@@ -260,6 +260,56 @@ def inspect(log: Path, config_path: Path | None, settings: tuple[str, ...]) -> N
     click.echo(survey_text(log, found))
 
 
+@main.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@_configured
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FILE",
+    help="The calibration, YAML, for array.calibration.",
+)
+@click.option(
+    "--start",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    metavar="S",
+    help="Skip the first S seconds of the log.",
+)
+@click.option(
+    "--end",
+    type=click.FloatRange(min=0),
+    default=float("inf"),
+    metavar="S",
+    help="Stop after S seconds of the log.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print what was found as one JSON object.")
+def calibrate(
+    log: Path, config_path: Path | None, settings: tuple[str, ...], **options: Any
+) -> None:
+    """Find each gyro's bias, scale, misalignment and mounting, relative to the array.
+
+    The log should have the array turned about all three axes, both ways, and some seconds at rest.
+    Mountings are found, and the largest group of sensors that sit alike says what the body axes
+    are; or they are taken from the calibration that --config names.
+
+    \b
+    risaf-link calibrate turned.tlog --out board-7.yaml
+    risaf-link replay drive.tlog --set array.calibration=board-7.yaml
+    """
+    from risaf_link.calibrate import calibrate_log, summary, write
+    from risaf_link.config import load
+    from risaf_link.words import calibration_text
+
+    config = load(config_path, settings)
+    with _progress(log) as progress:
+        result = calibrate_log(config, log, options["start"], options["end"], progress)
+    write(options["out"], log, result)
+    found = summary(result)
+    click.echo(json.dumps(found) if options["as_json"] else calibration_text(log, found))
+
+
 @main.command("check-config")
 @click.argument("file", type=click.Path(path_type=Path))
 def check_config(file: Path) -> None:

@@ -7,27 +7,34 @@ Nothing here reads a clock, opens a file or waits. A live link and a log feed th
 that a live run that is recorded and replayed gives the same estimates, bit for bit.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from msgspec import Struct, field, structs
 
+from risaf_link.core import kernel
 from risaf_link.core.aiding import Aiding
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.attitude import AttitudeParameters, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.estimate import ArrayStatus, Estimate
-from risaf_link.core.fusion import FUSIONS, Epoch, Fusion, FusionParameters
+from risaf_link.core.fusion import Epoch, Fusion, FusionParameters, Mean, Median
 from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import ArrayHealth
-from risaf_link.core.robust import Robust
 from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.ingest import GpsParameters, Ingest
 
+FUSIONS: dict[str, Callable[[FusionParameters], Fusion]] = {
+    "robust": kernel.Robust,
+    "risaf": kernel.Risaf,
+    "median": Median,
+    "mean": Mean,
+}
 FORCE_RESOLUTION = 0.02  # m/s^2; no accelerometer is blamed for less
 HEALTH_PERIOD = 0.1  # s, from one judgement of the sensors to the next
 NO_FORCE = np.full(3, np.nan)
@@ -74,14 +81,14 @@ class Pipeline:
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
         self._clock = VehicleClock()
-        self._fusion: Fusion = {**FUSIONS, "robust": Robust}[p.fusion.method](p.fusion)
-        self._force_fusion = Robust(structs.replace(p.fusion, resolution=FORCE_RESOLUTION))
+        self._fusion = FUSIONS[p.fusion.method](p.fusion)
+        self._force_fusion = kernel.Robust(structs.replace(p.fusion, resolution=FORCE_RESOLUTION))
         self._health = self._fusion.health()
         self._judged = 0.0  # s, when it was made
         self._filter: Eskf | PaperFilter
         self._aiding: Aiding | None = None
         if p.attitude.filter == "eskf":
-            self._filter, self._aiding = Eskf(p.attitude, p.heading), Aiding(p.attitude)
+            self._filter, self._aiding = Eskf(p.attitude, p.heading), Aiding()
         else:
             self._filter = PaperFilter(p.attitude)
         self._heading = p.heading

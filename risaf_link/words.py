@@ -72,6 +72,48 @@ def survey_text(log: Path, found: Survey) -> str:
     return "\n".join(lines)
 
 
+def calibration_text(log: Path, found: dict[str, Any]) -> str:
+    """What a calibration found: of each sensor, the axis that is farthest off."""
+    table = Table(box=None, header_style="bold")
+    for column in ("sensor", "bias deg/s", "scale off %", "misaligned deg", "before", "after"):
+        table.add_column(column, justify="right")
+    for i, row in enumerate(found["gyros"]):
+        apart = [_or_dash(row["before_dps"]), _or_dash(row["after_dps"])]
+        bias = _worst(row["bias_dps"], row["bias_std_dps"])
+        if row["calibrated"]:
+            scale = [100 * (value - 1) for value in row["scale"]]
+            scale_std = [100 * value for value in row["scale_std"]]
+            turned = _worst(row["misalignment_deg"], row["misalignment_std_deg"])
+            table.add_row(str(i), bias, _worst(scale, scale_std), turned, *apart)
+        else:
+            share = f"{100 * row['used']:.0f} % usable"
+            table.add_row(str(i), bias, "not calibrated", share, *apart)
+    apart = found["disagreement_dps"]
+    rest = found["rest_s"]
+    lines = [
+        f"{log}: {found['sensors']} gyros, {found['moving_s']:.1f} s in motion, "
+        + (f"{rest:.1f} s at rest" if rest else "no rest: biases are relative, their mean is zero"),
+        _text(table),
+        "before, after: RMS from the array's mean in motion, deg/s, judged on motion not used to "
+        "calibrate",
+        f"{found['calibrated']} of {found['sensors']} calibrated; sensors differ by "
+        f"{apart['before']:.3f} deg/s RMS before and {apart['after']:.3f} after, "
+        f"{apart['before_untimed']:.3f} and {apart['after_untimed']:.3f} without what differences "
+        "of sampling time make",
+    ]
+    return "\n".join(lines)
+
+
+def _worst(values: list[float], deviations: list[float | None]) -> str:
+    """The value farthest from zero, with its deviation."""
+    worst = max(range(len(values)), key=lambda i: abs(values[i]))
+    return f"{values[worst]:+.3f} ± {_or_dash(deviations[worst])}"
+
+
+def _or_dash(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
 def _count(number: int) -> str:
     return str(number) if number else "none"
 

@@ -37,7 +37,9 @@ def test_version():
     assert call("--version").stdout == f"risaf-link, version {__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["run", "replay", "simulate", "inspect", "check-config"])
+@pytest.mark.parametrize(
+    "command", ["run", "replay", "simulate", "inspect", "calibrate", "check-config"]
+)
 def test_every_command_has_help_with_an_example(command):
     result = call(command, "--help")
     assert result.exit_code == 0

@@ -8,15 +8,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from filters import (
+    DEFAULTS,
+    DOWN,
+    DT,
+    GATE,
+    SENSORS,
+    aligned_filter,
+    assert_sound,
+    degrees_between,
+    fused,
+    level_filter,
+    run,
+    settled_filter,
+    tilt_error,
+)
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace as set_parameters
 
-from risaf_link.core.aiding import Aiding, SpeedTracker
-from risaf_link.core.attitude import AttitudeParameters
+from risaf_link.core.aiding import Aiding
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
-from risaf_link.core.eskf import ATTITUDE, STATES, Eskf, Gravity, Outcome
-from risaf_link.core.fusion import FusedRate, FusionParameters
+from risaf_link.core.eskf import ACCELEROMETER, ATTITUDE, STATES, Eskf, Gravity, Outcome, drive
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import (
     euler_from_quaternion,
@@ -27,61 +40,8 @@ from risaf_link.core.rotation import (
 
 DATA = Path(os.environ.get("RISAF_DATA", Path(__file__).parents[1] / "../shared/data"))
 RUNS = sorted((DATA / "ekf2_runs").glob("*.npz"))
-DEFAULTS = AttitudeParameters()
-SENSORS = FusionParameters()
-UNKNOWN = np.full(3, np.nan)
-DOWN = np.array([0.0, 0.0, GRAVITY])
-DT = 0.01
-GATE = 3.0
 ZURICH = math.radians(47.4)
-
-
-def fused(rate_b, noise=UNKNOWN, sensors=1, dt=DT):
-    """What a fusion makes of sensors of the default parameters; `noise` where it is told."""
-    rate_b = np.asarray(rate_b, dtype=float)
-    noise = np.where(np.isnan(noise), SENSORS.gyro_noise**2 / dt / sensors, noise)
-    walk = np.full(3, SENSORS.bias_walk / math.sqrt(sensors))
-    return FusedRate(0, rate_b, UNKNOWN, np.full(3, sensors), sensors, noise, walk)
-
-
-def level_filter(parameters=DEFAULTS):
-    """A filter that knows the tilt, not yet yaw."""
-    estimator = Eskf(parameters)
-    estimator.predict(fused(np.zeros(3)), DT)
-    estimator.correct_gravity(Gravity(DOWN, 1e-4, 1e-4))
-    return estimator
-
-
-def aligned_filter(yaw=0.0, std=0.02, parameters=DEFAULTS):
-    estimator = level_filter(parameters)
-    estimator.correct_heading(yaw, std**2, 0.0, GATE)
-    return estimator
-
-
-def run(estimator, seconds, rate_b=(0.0, 0.0, 0.0), dt=DT):
-    for _ in range(round(seconds / dt)):
-        estimator.predict(fused(rate_b, dt=dt), dt)
-
-
-def degrees_between(p_nb, q_nb):
-    turned = np.trace(matrix_from_quaternion(p_nb).T @ matrix_from_quaternion(q_nb))
-    return math.degrees(math.acos(min(1.0, max(-1.0, (turned - 1.0) / 2.0))))
-
-
-def tilt_error(estimator, truth_nb):
-    """Angle between the estimated vertical and the true one, deg."""
-    down = estimator.matrix[2] @ matrix_from_quaternion(truth_nb)[2]
-    return math.degrees(math.acos(min(1.0, down)))
-
-
-def assert_sound(estimator):
-    covariance = estimator.covariance
-    deviation = np.sqrt(covariance.diagonal())
-    assert np.isfinite(covariance).all()
-    assert (covariance == covariance.T).all()
-    assert np.linalg.eigvalsh(covariance / np.outer(deviation, deviation)).min() > -1e-9
-    assert np.isfinite(estimator.state(0).q_nb).all()
-    assert abs(np.linalg.norm(estimator.state(0).q_nb) - 1.0) < 1e-12
+SIMULATED = ACCELEROMETER.stop  # states: all but what is wrong with headings
 
 
 # Prediction
@@ -156,6 +116,30 @@ def test_without_accelerometer_the_tilt_is_as_unknown_as_the_bias_makes_it():
     assert not state.aligned
 
 
+def test_an_error_of_scale_grows_with_the_angle_turned_and_goes_with_turning_back():
+    known = set_parameters(DEFAULTS, initial_bias_std=1e-9, turn_error=0.0)
+    estimator = aligned_filter(std=1e-3, parameters=known)
+    run(estimator, 10.0, (0.0, 0.0, 2.0))
+    assert estimator.state(0).yaw_std == pytest.approx(20.0 * DEFAULTS.scale_std, rel=0.02)
+    run(estimator, 10.0, (0.0, 0.0, -2.0))
+    assert estimator.state(0).yaw_std < math.hypot(0.002, HeadingParameters().offset_std)
+
+
+def test_an_error_of_scale_is_learnt_from_headings():
+    """A gyro that shows 0.5 % too much: turns and stops under GPS, then three turns without."""
+    estimator = aligned_filter(std=0.02)
+    truth, errors = 0.0, []
+    for step in range(12000):
+        rate = 2.0 if step >= 11000 else 1.0 if step % 2000 < 1000 else 0.0
+        truth = wrap(truth + rate * DT)
+        estimator.predict(fused([0.0, 0.0, 1.005 * rate]), DT)
+        if step < 11000 and step % 20 == 0:
+            estimator.correct_heading(truth, 0.02**2, 0.0, GATE)
+        elif step >= 11000:
+            errors.append(wrap(estimator.state(0).euler[2] - truth))
+    assert np.abs(errors).max() < 0.3 * 0.005 * 20.0
+
+
 def test_an_array_of_many_sensors_wanders_less():
     known = set_parameters(DEFAULTS, initial_bias_std=1e-9, initial_tilt_std=1e-9)
     tilts = []
@@ -175,7 +159,7 @@ def test_an_array_of_many_sensors_wanders_less():
 def test_the_tilt_is_that_of_gravity_from_the_start(roll, pitch):
     truth = quaternion_from_euler(math.radians(roll), math.radians(pitch), 0.0)
     force_b = -DOWN @ matrix_from_quaternion(truth)
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
+    estimator, aiding = Eskf(DEFAULTS), Aiding()
     for _ in range(70):
         estimator.predict(fused(np.zeros(3)), DT)
         aiding.take(estimator, fused(np.zeros(3)), force_b, DT)
@@ -261,15 +245,6 @@ def jump(estimator, angle, seconds, at_rest):
     return corrections
 
 
-def settled_filter():
-    estimator = aligned_filter()
-    for _ in range(25):
-        run(estimator, 0.2)
-        estimator.correct_heading(0.0, 0.02**2, 0.0, GATE)
-        estimator.correct_zero_rate(np.zeros(3), np.full(3, 1e-8), confirmed=True)
-    return estimator
-
-
 def test_a_heading_beyond_the_gate_is_rejected_and_changes_nothing():
     estimator = settled_filter()
     before = estimator.state(0)
@@ -339,7 +314,7 @@ def test_the_derivative_of_yaw_is_that_of_a_difference(tilt):
 
 @pytest.mark.parametrize("spin", [0.0, 1.0, 5.0, 25.0])
 def test_two_degrees_of_tilt_are_gone_within_four_seconds_while_spinning(spin):
-    estimator, aiding = aligned_filter(), Aiding(DEFAULTS)
+    estimator, aiding = aligned_filter(), Aiding()
     truth = quaternion_from_euler(0.0, 0.0, 0.0)
     estimator._correction = tuple(quaternion_from_euler(math.radians(2.0), 0.0, 0.0))
     estimator._covariance[ATTITUDE, ATTITUDE] = np.eye(3) * 0.05**2
@@ -351,7 +326,7 @@ def test_two_degrees_of_tilt_are_gone_within_four_seconds_while_spinning(spin):
 
 def test_level_is_found_again_after_a_dropout_of_the_accelerometer():
     """PX4 issue 24299: 4 s at 8 deg/s and 1.25 g, then level; below 5 deg within 8 s."""
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
+    estimator, aiding = Eskf(DEFAULTS), Aiding()
 
     def go(seconds, rate_b, force_b):
         for _ in range(round(seconds / DT)):
@@ -381,129 +356,6 @@ def test_no_tilt_is_so_wrong_that_gravity_stays_locked_out(angle):
     assert_sound(estimator)
 
 
-def drive(seconds, speed, rate_b, force_b, told=True, noise=0.0):
-    """A filter and its aiding on a level road, yaw known; the largest tilt error, deg."""
-    estimator, aiding = aligned_filter(), Aiding(DEFAULTS)
-    generator = np.random.default_rng(1)
-    yaw, worst = 0.0, 0.0
-    for step in range(round(seconds / DT)):
-        time = step * DT
-        rate = np.array(rate_b(time))
-        yaw += rate[2] * DT
-        estimator.predict(fused(rate), DT)
-        force = np.array(force_b(time)) + noise * generator.normal(size=3)
-        aiding.take(estimator, fused(rate), force, DT)
-        if told and step % 20 == 0:
-            aiding.speed.hear(speed(time), 0.1**2, 0.0)
-            estimator.correct_heading(wrap(yaw), 0.02**2, 0.0, GATE)
-        worst = max(worst, tilt_error(estimator, quaternion_from_euler(0.0, 0.0, 0.0)))
-    return worst, estimator
-
-
-@pytest.mark.parametrize(("told", "limit"), [(True, 0.15), (False, 1.0)])
-def test_a_curve_does_not_tilt_the_attitude(told, limit):
-    """10 s at 15 m/s and 0.15 rad/s: the apparent vertical leans by 13 deg."""
-
-    def rate(time):
-        return (0.0, 0.0, 0.15 if 20 < time < 30 else 0.0)
-
-    def force(time):
-        return (0.0, 15.0 * rate(time)[2], -GRAVITY)
-
-    worst, _ = drive(40.0, lambda _: 15.0, rate, force, told)
-    assert worst < limit
-
-
-@pytest.mark.parametrize(("told", "limit"), [(True, 0.5), (False, 1.0)])
-def test_braking_does_not_tilt_the_attitude(told, limit):
-    """3 m/s^2 for 5 s: the apparent vertical leans by 17 deg."""
-
-    def braking(time):
-        return 3.0 if 20 < time < 25 else 0.0
-
-    worst, _ = drive(
-        35.0,
-        lambda time: 25.0 - 3.0 * min(max(time - 20.0, 0.0), 5.0),
-        lambda _: (0.0, 0.0, 0.0),
-        lambda time: (-braking(time), 0.0, -GRAVITY),
-        told,
-    )
-    assert worst < limit
-
-
-# Rest
-
-
-def test_a_bias_that_climbs_at_rest_is_followed():
-    """PX4: 1 to 5 mrad/s, 30 s each; 0.8 mrad/s on x and y, 4 mrad/s on z."""
-    for sign in (1.0, -1.0):
-        estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
-        for bias in (0.0, 0.001, 0.002, 0.0035, 0.005):
-            rate_b = np.full(3, sign * bias)
-            for step in range(1500):
-                estimator.predict(fused(rate_b), 2 * DT)
-                aiding.take(estimator, fused(rate_b), -DOWN, 2 * DT)
-                if step % 10 == 0:
-                    aiding.speed.hear(0.1, 0.1**2, 0.0)
-            error = np.abs(estimator.state(0).bias_b - rate_b)
-            assert (error < [0.0008, 0.0008, 0.004]).all()
-
-
-def test_rest_is_found_without_gps():
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
-    generator = np.random.default_rng(5)
-    bias = np.array([0.004, -0.003, 0.005])
-    for _ in range(6000):
-        rate_b = bias + 0.002 * generator.normal(size=3)
-        estimator.predict(fused(rate_b), DT)
-        force_b = -DOWN + 0.05 * generator.normal(size=3)
-        aiding.take(estimator, fused(rate_b), force_b, DT)
-    state = estimator.state(0)
-    assert np.abs(state.bias_b - bias).max() < 5e-4
-    assert abs(state.euler[2]) < math.radians(3.0)
-
-
-def test_a_steady_curve_is_no_rest():
-    estimator, aiding = settled_filter(), Aiding(DEFAULTS)
-    generator = np.random.default_rng(6)
-    for _ in range(6000):
-        rate_b = [0.0, 0.0, 0.1] + 0.002 * generator.normal(size=3)
-        estimator.predict(fused(rate_b), DT)
-        force_b = [0.0, 1.0, -GRAVITY] + 0.05 * generator.normal(size=3)
-        for correction in aiding.take(estimator, fused(rate_b), force_b, DT):
-            assert correction.source != "rest" or not correction.fused
-    assert abs(estimator.state(0).bias_b[2]) < 1e-3
-
-
-def test_a_bias_far_from_expectation_is_found_where_gps_confirms_the_rest():
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
-    bias = np.array([0.0, 0.0, 0.2])
-    for step in range(3000):
-        estimator.predict(fused(bias), DT)
-        aiding.take(estimator, fused(bias), -DOWN, DT)
-        if step % 20 == 0:
-            aiding.speed.hear(0.1, 0.1**2, 0.0)
-    assert np.abs(estimator.state(0).bias_b - bias).max() < 1e-3
-
-
-def test_speed_and_its_change_are_tracked_through_the_delay():
-    speed, generator = SpeedTracker(), np.random.default_rng(7)
-    errors = []
-    for step in range(1, 6000):
-        speed.advance(DT)
-        if step % 20 == 0:
-            then = 10.0 + 5.0 * math.sin(0.1 * (step * DT - 0.2))
-            speed.hear(then + 0.1 * generator.normal(), 0.1**2, 0.2)
-            now = 10.0 + 5.0 * math.sin(0.1 * step * DT)
-            errors.append((speed.speed - now) ** 2 / speed.speed_variance)
-    assert np.mean(errors) < 1.5
-    run_out = speed.speed_variance
-    for _ in range(1000):
-        speed.advance(DT)
-    assert speed.speed_variance > 10 * run_out
-    assert not speed.recent
-
-
 # Honesty
 
 
@@ -520,10 +372,12 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
     truth = quaternion_from_euler(*generator.normal(size=2) * p.initial_tilt_std, yaw)
     truth_nb = matrix_from_quaternion(truth)
     bias = generator.normal(size=3) * p.initial_bias_std
-    estimator = Eskf(p, HeadingParameters(offset_std=0.0, delay_std=0.0))
+    estimator = Eskf(p, HeadingParameters(offset_std=1e-6, delay_std=1e-6))
     phases, speeds = generator.uniform(0, 6, 3), np.array([0.31, 0.47, 0.23])
     nees, nis = [], {"heading": [], "gravity": [], "rest": []}
-    lean = generator.normal(size=2) * p.accel_bias_std
+    scale = generator.normal(size=(3, 3)) * p.scale_std
+    force_bias = generator.normal(size=3) * p.accel_bias_std
+    force_scale = generator.normal(size=(3, 3)) * p.scale_std
     for step in range(round(seconds / dt)):
         rate = np.array([0.3, 0.3, 0.5]) * np.sin(speeds * step * dt + phases)
         if 0.5 < step * dt / seconds < 0.6:
@@ -533,11 +387,14 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
         truth_nb = truth_nb @ matrix_from_quaternion(np.array([math.cos(angle / 2), *half]))
         bias = bias + generator.normal(size=3) * SENSORS.bias_walk * math.sqrt(dt)
         noise = generator.normal(size=3) * SENSORS.gyro_noise / math.sqrt(dt)
-        estimator.predict(fused(rate + bias + noise, dt=dt), dt)
+        estimator.predict(fused(rate + scale @ rate + bias + noise, dt=dt), dt)
         corrections = ()
-        wrong_n = np.array([*(lean + 0.3 * generator.normal(size=2)), 0.0])
-        gravity_n = estimator.matrix @ truth_nb.T @ (DOWN + wrong_n)
-        corrections += estimator.correct_gravity(Gravity(gravity_n, 0.09, 0.09))
+        shaken_n = -DOWN + 0.3 * generator.normal(size=3)
+        force_b = truth_nb.T @ shaken_n
+        force_b = force_b + force_scale @ force_b + force_bias
+        by_errors = drive(estimator.matrix, GRAVITY * estimator.up_b)
+        gravity = Gravity(-estimator.matrix @ force_b, 0.09, 0.09, by_errors=by_errors)
+        corrections += estimator.correct_gravity(gravity)
         if step % 2 == 0:
             heading = math.atan2(truth_nb[1, 0], truth_nb[0, 0]) + 0.03 * generator.normal()
             corrections += (estimator.correct_heading(wrap(heading), 0.03**2, 0.0, 6.0),)
@@ -556,8 +413,10 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
                     difference[1, 0] - difference[0, 1],
                 ]
             )
-            error = np.concatenate((angles / 2, bias - estimator.state(0).bias_b))
-            nees.append(error @ np.linalg.solve(estimator.covariance, error))
+            wrong = np.concatenate((bias, scale.ravel(), force_bias, force_scale.ravel()))
+            error = np.concatenate((angles / 2, wrong - estimator.known_errors))
+            covariance = estimator.covariance[:SIMULATED, :SIMULATED]
+            nees.append(error @ np.linalg.solve(covariance, error))
             if step % 200 == 199:
                 assert_sound(estimator)
     return nees, {kind: np.mean(values) for kind, values in nis.items()}, nis
@@ -585,10 +444,12 @@ def chi_square_bounds(degrees):
 def test_the_average_nees_over_50_seeds_is_within_its_bounds(honesty):
     """At every time within three standard deviations, in the mean over time within 95 %."""
     nees, _ = honesty
-    averages = nees.mean(axis=0) / 6
-    low, high = chi_square_bounds(6 * len(nees))  # as if all times were one: they are correlated
+    averages = nees.mean(axis=0) / SIMULATED
+    low, high = chi_square_bounds(
+        SIMULATED * len(nees)
+    )  # as if all times were one: they are correlated
     assert low < averages.mean() < high
-    assert np.abs(averages - 1.0).max() < 3.0 * math.sqrt(2.0 / (6 * len(nees)))
+    assert np.abs(averages - 1.0).max() < 3.0 * math.sqrt(2.0 / (SIMULATED * len(nees)))
 
 
 @pytest.mark.parametrize("kind", ["heading", "gravity", "rest"])
@@ -600,41 +461,6 @@ def test_the_average_nis_over_50_seeds_is_within_its_bounds(honesty, kind):
 
 
 # Soundness
-
-
-NUMBERS = st.one_of(
-    st.floats(allow_nan=True, allow_infinity=True),
-    st.floats(-10.0, 10.0),
-)
-TRIPLES = st.tuples(NUMBERS, NUMBERS, NUMBERS).map(np.array)
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.data())
-def test_nothing_that_is_fed_makes_the_state_unsound(data):
-    estimator, aiding = aligned_filter(), Aiding(DEFAULTS)
-    for _ in range(data.draw(st.integers(1, 8))):
-        action = data.draw(st.integers(0, 5))
-        a, b, c = (data.draw(NUMBERS) for _ in range(3))
-        with np.errstate(all="ignore"):
-            if action == 0:
-                estimator.predict(fused(data.draw(TRIPLES), data.draw(TRIPLES), 2), a)
-            elif action == 1:
-                estimator.correct_heading(a, b, c, GATE)
-            elif action == 2:
-                estimator.correct_gravity(Gravity(data.draw(TRIPLES), a, b))
-            elif action == 3:
-                estimator.correct_zero_rate(data.draw(TRIPLES), data.draw(TRIPLES), a > 0)
-            elif action == 4:
-                aiding.speed.hear(a, b, c)
-                estimator.set_latitude(a)
-                estimator.reset_heading(a, b, c, GATE)
-            else:
-                rate = fused(data.draw(TRIPLES))
-                for _ in range(30):
-                    aiding.take(estimator, rate, data.draw(TRIPLES), 0.01)
-        run(estimator, 0.05)
-        assert_sound(estimator)
 
 
 def test_a_measurement_that_is_no_number_says_so():
@@ -672,7 +498,7 @@ def test_heading_in_an_outage_of_200_s_beats_px4(path):
     fixes = dict(
         zip(np.searchsorted(log["t_us"], log["gps"][:, 0]), log["gps"][:, 4:6], strict=True)
     )
-    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
+    estimator, aiding = Eskf(DEFAULTS), Aiding()
     estimator.set_latitude(math.radians(log["gps"][0, 1]))
     errors = []
     for k in range(len(gyro)):

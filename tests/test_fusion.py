@@ -8,9 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from risaf_link.core.fusion import FUSIONS, Epoch, FusionParameters, quantiles
+from risaf_link.core import fusion as numpy_forms
+from risaf_link.core import kernel
+from risaf_link.core.fusion import Epoch, FusionParameters, Mean, Median, quantiles
 
 AGREEMENT = 1e-9  # rad/s
+FUSIONS = {"risaf": numpy_forms.Risaf, "mean": Mean, "median": Median}
+
+
+@pytest.fixture(params=["numpy", "kernel"], autouse=True)
+def _form(request, monkeypatch):
+    """Run every test on both forms of the fusion."""
+    if request.param == "kernel":
+        if not kernel.BUILT:
+            pytest.skip("no kernel was built: that takes a C++ compiler")
+        monkeypatch.setitem(FUSIONS, "risaf", kernel.Risaf)
 
 
 # A coarse grid gives ties at the quantiles, as the counts of a real sensor do.

@@ -13,7 +13,7 @@ LAYERS = [
     {"pipeline"},
     {"links", "publish", "sim"},
     {"config"},
-    {"service", "replay", "survey"},
+    {"service", "replay", "survey", "calibrate"},
     {"words"},
     {"cli"},
 ]

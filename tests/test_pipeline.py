@@ -8,7 +8,6 @@ import pytest
 from vehicle import Vehicle
 
 from risaf_link.core.estimate import Estimate
-from risaf_link.core.fusion import FusionParameters
 from risaf_link.core.heading import HeadingState
 from risaf_link.core.rotation import yaw_of
 from risaf_link.mavlink import risaf
@@ -26,8 +25,8 @@ PERIOD_US = 10_000
 class Drive:
     """A pipeline and a vehicle that feeds it, sample by sample; time is the vehicle's."""
 
-    def __init__(self, parameters: PipelineParameters | None = None) -> None:
-        self.vehicle = Vehicle(sensors=5)
+    def __init__(self, parameters: PipelineParameters | None = None, sensors: int = 5) -> None:
+        self.vehicle = Vehicle(sensors)
         self.pipeline = Pipeline(parameters or PipelineParameters(), OWN)
         self.time_us = 5_000_000
         self.take(self.vehicle.info())
@@ -193,8 +192,39 @@ def test_messages_are_thinned_out_on_the_estimates_own_time(drive):
     assert {sum(sent[k : k + 5]) for k in range(0, 1000, 5)} == {1}
 
 
-def test_the_robust_fusion_can_be_chosen():
-    fusion = FusionParameters(method="robust")
-    drive = Drive(parameters=PipelineParameters(fusion=fusion))
-    estimate = drive.go(6, rate_z=math.radians(9), course=1.0)
-    assert estimate.fused.rate_b == pytest.approx([0, 0, math.radians(9)], abs=1e-3)
+def test_every_sensors_standing_goes_round_with_its_reason():
+    drive, generator = Drive(sensors=35), np.random.default_rng(1)
+    rates = ["ARRAY_STATUS", "ARRAY_SENSOR_HEALTH", "ARRAY_SENSOR_REASON"]
+    emitter = Emitter(dict.fromkeys(rates, 1.0), *OWN)
+    decoder, told = risaf.MAVLink(None), []
+    bias = np.linspace(-0.02, 0.02, 35)[:, np.newaxis] * [1.0, -1.0, 0.5]
+    for step in range(800):
+        rate = bias + generator.normal(0.0, math.radians(0.1), (35, 3))
+        rate[3] = bias[3]
+        if step > 300:
+            rate[33] = math.nan
+        drive.time_us += PERIOD_US
+        (estimate,) = drive.take(drive.vehicle.epoch(drive.time_us, rate))
+        told += [decoder.parse_buffer(raw)[0] for raw in emitter.emit(estimate)]
+    array, health, reason = ([m for m in told if m.get_type() == name] for name in rates)
+    assert (array[-1].healthy, array[-1].suspect, array[-1].dead) == (33, 0, 2)
+    blocks = [(m.first_sensor, m.sensor_count) for m in health]
+    assert blocks[:4] == [(0, 30), (30, 5), (0, 30), (30, 5)]
+    first, second = sorted(health[-2:], key=lambda m: m.first_sensor)
+    assert first.state[3] == second.state[3] == risaf.RISAF_SENSOR_STATE_DEAD
+    assert sum(first.state) + sum(second.state) == 2 * risaf.RISAF_SENSOR_STATE_DEAD
+    assert np.reshape(first.relative_bias, (30, 3))[10] == pytest.approx(bias[10] * 1e5, abs=100)
+    assert (reason[-1].first_sensor, reason[-1].sensor_count) == (0, 35)
+    assert reason[-1].reason[3] == risaf.RISAF_SENSOR_REASON_FROZEN
+    assert reason[-1].reason[33] == risaf.RISAF_SENSOR_REASON_SILENT
+    assert sum(reason[-1].reason) == 9
+
+
+def test_accelerometers_hold_the_tilt_that_gyros_alone_lose():
+    drive = Drive()
+    drive.go(10, course=0.0)
+    for _ in range(6000):
+        drive.time_us += PERIOD_US
+        drive.take(drive.vehicle.forces(drive.time_us, (0.0, 1.0, -9.75)))
+        (estimate,) = drive.take(drive.vehicle.epoch(drive.time_us))
+    assert estimate.attitude.euler[0] == pytest.approx(math.atan2(-1.0, 9.75), abs=0.01)

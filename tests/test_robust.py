@@ -1,13 +1,14 @@
 """Robust fusion of simulated arrays, against the truth; the three axes are three draws."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
 
+from risaf_link.core import kernel, robust
 from risaf_link.core.fusion import Epoch, FusionParameters
 from risaf_link.core.health import Reason, SensorState
-from risaf_link.core.robust import Robust
 
 RATE = 25.0
 NOISE = math.radians(0.1)  # of one reading
@@ -16,6 +17,18 @@ WALK = math.radians(0.003)  # 1/sqrt(s)
 RANGE = math.radians(250.0)
 DEGREE = math.radians(1.0)
 PARAMETERS = FusionParameters(bias_walk=WALK)
+
+
+Robust = robust.Robust
+FORMS = {"numpy": robust.Robust, "kernel": kernel.Robust}
+
+
+@pytest.fixture(params=FORMS, autouse=True)
+def _form(request, monkeypatch):
+    """Run every test on both forms of the fusion."""
+    if request.param == "kernel" and not kernel.BUILT:
+        pytest.skip("no kernel was built: that takes a C++ compiler")
+    monkeypatch.setattr(sys.modules[__name__], "Robust", FORMS[request.param])
 
 
 class Drive:
@@ -44,19 +57,19 @@ class Drive:
         since = np.arange(len(rest))[:, np.newaxis, np.newaxis] / self.rate
         rest += self.generator.exponential(size, rest.shape[1:]) * np.exp(-since / decay)
 
-    def fused(self, robust=None):
-        return fuse(self.readings, self.rate, robust)
+    def fused(self, fusion=None):
+        return fuse(self.readings, self.rate, fusion)
 
 
-def fuse(readings, rate=RATE, robust=None):
+def fuse(readings, rate=RATE, fusion=None):
     """Every epoch's result, and the fusion as it is then."""
-    robust = robust or Robust(PARAMETERS)
+    fusion = fusion or Robust(PARAMETERS)
     none = np.zeros((0, 3))
     results = [
-        robust.fuse(Epoch(i, 1.0 / rate if i else 0.0, epoch, none, 0))
+        fusion.fuse(Epoch(i, 1.0 / rate if i else 0.0, epoch, none, 0))
         for i, epoch in enumerate(readings)
     ]
-    return results, robust
+    return results, fusion
 
 
 def rates(results):
@@ -188,20 +201,30 @@ def test_the_stated_bias_walk_is_that_of_the_fused_bias():
     assert 30.8 / 48 < np.mean(squares) < 69.0 / 48  # 48 draws of chi-square
 
 
-def test_where_nothing_changes_no_single_sensor_is_blamed():
-    """Coarse counts of a vehicle at rest look so."""
+def test_everything_at_once_frozen_is_flagged_and_no_reason_to_stop():
     drive = Drive(10, 12.0)
     drive.readings[drive.at(10) :] = drive.readings[drive.at(10)]
-    results, robust = drive.fused()
-    assert (robust.health().state == SensorState.HEALTHY).all()
+    results, fusion = drive.fused()
+    assert (fusion.health().state == SensorState.DEAD).all()
+    assert (fusion.health().reason == Reason.FROZEN).all()
     assert np.isfinite(rates(results)).all()
+
+
+def test_counts_that_are_coarser_than_the_noise_do_not_look_frozen_at_rest():
+    drive = Drive(4, 20.0, walk=0.0)
+    noise = drive.readings - drive.truth[:, np.newaxis] - drive.bias
+    drive.truth[drive.at(10) :] = 0.0
+    drive.readings = drive.truth[:, np.newaxis] + drive.bias + 0.01 * noise
+    drive.readings = np.rint(drive.readings / 0.001) * 0.001
+    _, fusion = drive.fused()
+    assert not (fusion.health().reason == Reason.FROZEN).any()
 
 
 def test_a_shock_to_all_passes_and_leaves_every_sensor_trusted_in_the_end():
     drive = Drive(30, 30.0)
     drive.shock(slice(None), 10.0)
-    results, robust = drive.fused()
-    assert (robust.health().state == SensorState.HEALTHY).sum() >= 27
+    results, fusion = drive.fused()
+    assert (fusion.health().state == SensorState.HEALTHY).sum() >= 27
     error = rates(results) - drive.truth - drive.bias.mean(axis=1)
     moved = error[drive.at(25) :].mean(axis=0) - error[drive.at(5) : drive.at(10)].mean(axis=0)
     assert np.abs(moved).max() < 0.1 * BIAS
@@ -220,35 +243,35 @@ def test_a_shock_to_all_passes_and_leaves_every_sensor_trusted_in_the_end():
 def test_a_sensor_is_told_what_is_wrong_with_it(fault, state, reason):
     drive = Drive(20, 20.0)
     fault(drive, slice(0, 1))
-    _, robust = drive.fused()
-    assert robust.health().state[0] == state
-    assert robust.health().reason[0] == reason
-    assert (robust.health().state[1:] == SensorState.HEALTHY).sum() >= 17
+    _, fusion = drive.fused()
+    assert fusion.health().state[0] == state
+    assert fusion.health().reason[0] == reason
+    assert (fusion.health().state[1:] == SensorState.HEALTHY).sum() >= 17
 
 
 def test_a_slow_drift_is_seen_before_any_reading_is_outlying():
     drive = Drive(20, 40.0)
     drive.readings[:, 0] += 0.01 * DEGREE * np.arange(len(drive.readings))[:, np.newaxis] / RATE
-    _, robust = drive.fused()
-    assert robust.health().reason[0] in {Reason.WANDERING, Reason.SETTLING}
-    assert robust.health().rejected[0] < 0.2
+    _, fusion = drive.fused()
+    assert fusion.health().reason[0] in {Reason.WANDERING, Reason.SETTLING}
+    assert fusion.health().rejected[0] < 0.2
 
 
 def test_a_sensor_that_recovers_is_used_again():
     drive = Drive(10, 60.0)
     drive.readings[drive.at(10) : drive.at(20), 0] = RANGE
     drive.readings[drive.at(10) : drive.at(50), 1] = np.nan
-    _, robust = drive.fused()
-    assert (robust.health().state[:2] == SensorState.HEALTHY).all()
+    _, fusion = drive.fused()
+    assert (fusion.health().state[:2] == SensorState.HEALTHY).all()
 
 
 def test_a_sensor_that_stepped_for_good_comes_back_with_its_new_bias():
     drive = Drive(10, 60.0)
     drive.readings[drive.at(10) :, 0] += 2.0 * DEGREE
-    results, robust = drive.fused()
-    assert robust.health().state[0] == SensorState.HEALTHY
+    results, fusion = drive.fused()
+    assert fusion.health().state[0] == SensorState.HEALTHY
     expected = drive.bias[-1, 0] + 2.0 * DEGREE - drive.bias[-1, 1:].mean(axis=0)
-    assert np.allclose(robust.relative_bias[0], expected, atol=0.4 * BIAS)
+    assert np.allclose(fusion.relative_bias[0], expected, atol=0.4 * BIAS)
     error = rates(results) - drive.truth - drive.bias.mean(axis=1)
     moved = error[-drive.at(5) :].mean(axis=0) - error[drive.at(5) : drive.at(10)].mean(axis=0)
     assert np.abs(moved).max() < 0.2 * BIAS
@@ -259,10 +282,10 @@ def test_times_are_seconds_at_every_rate(rate):
     drive = Drive(12, 10.0, rate=rate)
     drive.readings[drive.at(1) : drive.at(3), 0] = np.nan
     drive.readings[drive.at(1) :, 1] = 0.0
-    robust, states = Robust(PARAMETERS), []
+    fusion, states = Robust(PARAMETERS), []
     for i, epoch in enumerate(drive.readings):
-        robust.fuse(Epoch(i, 1 / rate if i else 0.0, epoch, np.zeros((0, 3)), 0))
-        states.append(robust.health().state)
+        fusion.fuse(Epoch(i, 1 / rate if i else 0.0, epoch, np.zeros((0, 3)), 0))
+        states.append(fusion.health().state)
     silent, unchanging = np.transpose(states)[:2]
     dead = silent == SensorState.DEAD
     assert dead.argmax() / rate == pytest.approx(2.0, abs=0.05)
@@ -275,20 +298,20 @@ def test_times_are_seconds_at_every_rate(rate):
 
 def test_one_sensor_is_taken_as_it_is_and_believed_as_configured():
     drive = Drive(1, 2.0)
-    results, robust = drive.fused()
+    results, fusion = drive.fused()
     assert np.array_equal(rates(results), drive.readings[:, 0])
     assert np.isnan(results[-1].variance).all()
     assert np.allclose(results[-1].noise, PARAMETERS.gyro_noise**2 * RATE)
     assert np.allclose(results[-1].bias_walk, PARAMETERS.bias_walk)
-    assert robust.health().state.tolist() == [SensorState.HEALTHY]
+    assert fusion.health().state.tolist() == [SensorState.HEALTHY]
 
 
 def test_of_two_sensors_the_mean_is_taken_and_neither_is_blamed():
     drive = Drive(2, 10.0)
     drive.readings[:, 0] += DEGREE
-    results, robust = drive.fused()
+    results, fusion = drive.fused()
     assert np.allclose(rates(results), drive.readings.mean(axis=1))
-    assert robust.health().state.tolist() == [SensorState.HEALTHY] * 2
+    assert fusion.health().state.tolist() == [SensorState.HEALTHY] * 2
     assert np.allclose(results[-1].noise, NOISE**2 / 2, rtol=0.8)
 
 
@@ -296,13 +319,13 @@ def test_an_array_may_grow_and_shrink_without_a_step_of_the_rate():
     drive = Drive(30, 60.0)
     # Of ten sensors more, each of 2 deg/s, nothing may show but what they settle to.
     drive.readings[:, 20:] += 2.0 * DEGREE
-    robust = Robust(PARAMETERS)
+    fusion = Robust(PARAMETERS)
     sizes = [(0.0, 20.0, 20), (20.0, 40.0, 30), (40.0, 60.0, 12)]
     parts = [
-        rates(fuse(drive.readings[drive.at(a) : drive.at(b), :n], robust=robust)[0])
+        rates(fuse(drive.readings[drive.at(a) : drive.at(b), :n], fusion=fusion)[0])
         for a, b, n in sizes
     ]
-    assert len(robust.health().state) == 12
+    assert len(fusion.health().state) == 12
     error = np.vstack(parts) - drive.truth
     means = error.reshape(12, -1, 3).mean(axis=1)  # over 5 s
     assert np.abs(means - means[0]).max() < 0.15 * BIAS
@@ -321,37 +344,37 @@ def test_there_is_a_rate_as_long_as_one_reading_is_valid():
 
 
 def test_no_array_at_all_is_no_rate():
-    results, robust = fuse(np.zeros((3, 0, 3)))
+    results, fusion = fuse(np.zeros((3, 0, 3)))
     assert np.isnan(rates(results)).all()
-    assert robust.health().state.shape == (0,)
+    assert fusion.health().state.shape == (0,)
 
 
 @pytest.mark.parametrize("dt", [0.0, math.nan, -1.0, 1e9])
 def test_any_time_step_is_survived(dt):
     drive = Drive(5, 4.0)
-    _, robust = drive.fused()
+    _, fusion = drive.fused()
     epochs = [Epoch(0, dt, epoch, np.zeros((0, 3)), 0) for epoch in drive.readings[:5]]
-    results = [robust.fuse(epoch) for epoch in epochs]
+    results = [fusion.fuse(epoch) for epoch in epochs]
     assert np.abs(rates(results) - drive.truth[:5]).max() < 5 * BIAS
-    assert (robust.health().state == SensorState.HEALTHY).all()
+    assert (fusion.health().state == SensorState.HEALTHY).all()
 
 
 def test_coarse_counts_are_no_fault():
     drive = Drive(30, 15.0)
     count = 2 * math.radians(2000.0) / 65536
     drive.readings = np.rint(drive.readings / count) * count
-    _, robust = drive.fused()
-    assert (robust.health().state == SensorState.HEALTHY).sum() >= 27
+    _, fusion = drive.fused()
+    assert (fusion.health().state == SensorState.HEALTHY).sum() >= 27
 
 
 def test_accelerometers_are_fused_by_the_same_code():
     forces = np.random.default_rng(1).normal([0.0, 0.0, -9.8], 0.05, (400, 12, 3))
     forces[200:, 0] = 0.0
-    robust = Robust(FusionParameters(resolution=0.01, bias_walk=1e-3))
+    fusion = Robust(FusionParameters(resolution=0.01, bias_walk=1e-3))
     for i, epoch in enumerate(forces):
-        fused = robust.fuse_readings(i, 0.01, epoch)
+        fused = fusion.fuse_readings(i, 0.01, epoch)
     assert np.allclose(fused.rate_b, [0.0, 0.0, -9.8], atol=0.1)
-    assert robust.health().state[0] == SensorState.DEAD
+    assert fusion.health().state[0] == SensorState.DEAD
 
 
 def test_a_thousand_sensors_are_fused():
@@ -360,3 +383,23 @@ def test_a_thousand_sensors_are_fused():
     results, _ = drive.fused()
     error = rates(results) - drive.truth - drive.bias.mean(axis=1)
     assert np.abs(error).max() < NOISE
+
+
+@pytest.mark.parametrize("sensors", [1, 2, 3, 5, 150])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_kernel_does_what_the_numpy_form_says(fault, sensors):
+    if not kernel.BUILT:
+        pytest.skip("no kernel was built: that takes a C++ compiler")
+    drive = Drive(sensors, 40.0)
+    fault(drive, slice(0, int(0.4 * sensors)))
+    stated, numpy_form = fuse(drive.readings, fusion=robust.Robust(PARAMETERS))
+    done, kernel_form = fuse(drive.readings, fusion=kernel.Robust(PARAMETERS))
+    for a, b in zip(stated, done, strict=True):
+        assert (a.active.tolist(), a.valid) == (b.active.tolist(), b.valid)
+        for name in ("rate_b", "variance", "noise", "bias_walk"):
+            x, y = getattr(a, name), getattr(b, name)
+            # The rate is a sum of readings: what rounds is as large as they are.
+            assert np.allclose(x, y, rtol=1e-12, atol=1e-12 * (name == "rate_b"), equal_nan=True)
+    assert (numpy_form.health().state == kernel_form.health().state).all()
+    assert (numpy_form.health().reason == kernel_form.health().reason).all()
+    assert np.allclose(numpy_form.relative_bias, kernel_form.relative_bias, rtol=1e-9, atol=1e-14)

@@ -8,6 +8,7 @@ from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import Frame, FrameParser, encode
 
 SCALE = math.radians(0.01)  # rad/s a count
+FORCE_SCALE = 0.005  # m/s^2 a count
 
 
 class Vehicle:
@@ -31,8 +32,8 @@ class Vehicle:
             time_usec=0,
             gyro_scale=SCALE,
             gyro_range=math.inf,
-            accel_scale=math.nan,
-            accel_range=math.nan,
+            accel_scale=FORCE_SCALE,
+            accel_range=math.inf,
             rate=100.0,
             sensor_count=self.sensors,
             array_id=0,
@@ -50,6 +51,21 @@ class Vehicle:
             epoch_seq=time_us // 10_000 % 65536,
             first_sensor=0,
             rates=[*counts.ravel().tolist(), *[0] * (120 - counts.size)],
+            sensor_count=self.sensors,
+            array_id=0,
+        )
+
+    def forces(self, time_us: int, force: object) -> Frame:
+        """One ACCEL_ARRAY; `force` (3,) or (sensors, 3), m/s^2; send it before its GYRO_ARRAY."""
+        forces = np.broadcast_to(np.asarray(force, float), (self.sensors, 3))
+        counts = np.round(forces / FORCE_SCALE).astype(int)
+        return self.frame(
+            "ACCEL_ARRAY",
+            158,
+            time_usec=time_us,
+            epoch_seq=time_us // 10_000 % 65536,
+            first_sensor=0,
+            forces=[*counts.ravel().tolist(), *[0] * (120 - counts.size)],
             sensor_count=self.sensors,
             array_id=0,
         )

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
 from risaf_link.core.eskf import (
+    ACCELEROMETER,
+    GYRO,
     LARGEST_FORCE,
     LARGEST_GAP,
     LARGEST_STEP,
@@ -16,19 +17,26 @@ from risaf_link.core.eskf import (
     Correction,
     Eskf,
     Gravity,
+    drive,
 )
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.gear import STANDING_SPEED
 from risaf_link.core.rotation import Floats
 
 PART, PARTS = 0.1, 30  # s, and their number in a mean of specific force
+HEAVES = 2.0  # standard deviations of the size that are no level acceleration
+FLOOR = 0.01  # m/s^2, of a mean: rounding, nonlinearity
 HIDDEN_TIME = 1.0  # s for which one lasts that drives it
+ANY_SPEED = 30.0  # m/s, that a vehicle may have whose speed nobody tells
+SPEED_TIME = 0.5  # s for which an error of the tracked speed lasts
 ACCELERATION_STD = 1.5  # m/s^2, of a vehicle along its way
 ACCELERATION_TIME = 2.0  # s for which it lasts
 SPEED_LOST = 15.0  # m/s, standard deviation beyond which a speed says nothing
 SPEED_JUMP = 1.0  # m/s; a speed that changes by more at once was wrong before
 BLOCK = 0.5  # s, of rest
 STILL, STILL_ALONE, STILL_ON_ROAD = 1.0, 3.0, 6.0  # s: GPS confirms, was never there, is gone
+STILL_BY_GRAVITY, CLAIMED_TURN = 10.0, 0.5  # s and rad, by which gravity refutes a rate
+LEVEL_PART = 0.6  # of that rate; a force that leans in a curve lends it less
 QUIET = np.array([0.05] * 3 + [0.5] * 3)  # rad/s, m/s^2, standard deviation within a block
 LOOSE = np.array([0.01] * 3 + [0.2] * 3)  # rad/s, m/s^2, between blocks, with GPS
 STRICT = np.array([3e-4] * 3 + [0.01] * 3)  # without
@@ -109,27 +117,27 @@ class GravityFinder:
     magnetic disturbance rejection", arXiv:2203.17024). What shakes a vehicle comes to nothing; the
     more so the more smoothly the mean begins and ends (a Hann window). Of what lasts, GPS tells
     what the speed and the rate make (along: its derivative; across: speed times rate). The rest
-    shows itself in two ways: means differ, and the specific force is not of gravity's size,
-    `|f|^2 - g^2 = |a|^2` for a level acceleration.
+    shows itself in two ways: means differ by more than the gyro's errors explain, and the specific
+    force is larger than gravity, `|f|^2 - g^2 = |a|^2` for a level acceleration. Where no speed was
+    ever told, a turn that lasts is held to be a curve, for as long as it lasts.
     """
 
-    def __init__(self, accel_bias_std: float) -> None:
-        self._bias_std = accel_bias_std
-        self._size = GRAVITY
-        self._doubt = 2.0 * GRAVITY * accel_bias_std  # (m/s^2)^2, of the square of the size
-        self._last: Floats | None = None  # the mean before, m/s^2, NED
+    def __init__(self) -> None:
+        self._last: Floats | None = None  # the mean before, m/s^2, i
         self._speed = 0.0  # m/s, at the epoch before
-        self._unsteady = 0.0  # (m/s^2)^2, variance of the means, each axis
+        self._curves = 0  # means since a lasting turn began
+        self._unsteady = 0.0  # (m/s^2)^2, variance of the means, each level axis
+        self._heaving = 0.0  # (m/s^2)^2, of their size
         self.restart()
 
     def restart(self) -> None:
         """Forget what was measured: the attitude between is not known."""
-        self._parts: deque[Floats] = deque(maxlen=PARTS)  # integrals of force and R_ib, turn, time
+        self._parts: deque[Floats] = deque(maxlen=PARTS)  # integrals, turn, time
         self._new = 0
         self._begin()
 
     def _begin(self) -> None:
-        self._part = np.zeros((3, 4))
+        self._part = np.zeros((3, 25))
         self._turned = self._time = 0.0
 
     def take(
@@ -139,14 +147,18 @@ class GravityFinder:
         if not (np.abs(force_b) < LARGEST_FORCE).all():
             return None
         matrix_ib = attitude.matrix_ib
+        level_b = force_b
         _, rate_y, rate_z = attitude.rate.tolist()
         if speed.speed_variance < speed.speed**2:
             gained = speed.speed - self._speed
             along = gained / dt if abs(gained) < SPEED_JUMP else 0.0
-            force_b = force_b - (along, speed.speed * rate_z, -speed.speed * rate_y)
+            level_b = force_b - (along, speed.speed * rate_z, -speed.speed * rate_y)
         self._speed = speed.speed
-        self._part[:, 0] -= matrix_ib @ force_b * dt
-        self._part[:, 1:] += matrix_ib * dt
+        self._part[:, 0] -= matrix_ib @ level_b * dt
+        self._part[:, 1:13] += attitude.drive_ib * dt
+        # By what it should be: the noise of a reading must not find itself in the bias it leads to.
+        support_b = force_b if not attitude.levelled else GRAVITY * attitude.up_b
+        self._part[:, 13:] += drive(matrix_ib, support_b) * dt
         self._time += dt
         self._turned += rate_z * dt
         if self._time < PART:
@@ -157,38 +169,63 @@ class GravityFinder:
         if self._last is not None and self._new < PARTS // 2:
             return None
         self._new = 0
-        return self._judge(attitude.matrix_ni, speed)
+        return self._judge(attitude, speed)
 
-    def learn_size(self, size: float) -> None:
-        """Take note that the vehicle stands: of this size, m/s^2, is gravity, and it is steady."""
-        if abs(size - GRAVITY) < 0.1 * GRAVITY:
-            self._size += 0.2 * (size - self._size)
-            self._doubt = max(0.8 * self._doubt, 0.4 * GRAVITY * self._bias_std)
-        self._unsteady = 0.0
-
-    def _judge(self, matrix_ni: Floats, speed: SpeedTracker) -> Gravity:
+    def _judge(self, attitude: Eskf, speed: SpeedTracker) -> Gravity:
         parts = np.array(self._parts)
-        times = parts[:, 13]
+        times = parts[:, 76]
         weights = np.hanning(len(parts) + 2)[1:-1] * times
         weights /= weights.sum()
-        integrals = parts[:, :12].reshape(-1, 3, 4)
-        mean_n = matrix_ni @ (weights @ (integrals[:, :, 0] / times[:, np.newaxis]))
+        integrals = parts[:, :75].reshape(-1, 3, 25)
+        means_i = np.einsum("k,kij->ij", weights / times, integrals)
         since = np.cumsum(weights) - weights / 2.0  # share of the mean older than each part
-        lever = matrix_ni @ np.einsum("k,kij->ij", since, integrals[:, :, 1:])
+        lever_i = np.einsum("k,kij->ij", since, integrals[:, :, 1:13])
+        matrix_ni = attitude.matrix_ni
+        means_n, lever = matrix_ni @ means_i, matrix_ni @ lever_i
         span = float(times.sum()) / 2.0  # that the window is worth
-        change = mean_n - (mean_n if self._last is None else self._last)
-        self._last = mean_n
-        now = float(change @ change) / 5.0  # of 3 axes, 1/6 of each in common
+        by_errors = means_n[:, 13:]
+        size = float(np.linalg.norm(means_n[:, 0] + by_errors @ attitude.known_errors[12:]))
+        covariance = attitude.covariance
+        size_variance = float(
+            by_errors[2] @ covariance[ACCELEROMETER, ACCELEROMETER] @ by_errors[2]
+        )
+        change = np.zeros(3) if self._last is None else matrix_ni @ (means_i[:, 0] - self._last)
+        drift = lever[0:2] @ covariance[GYRO, GYRO] @ lever[0:2].T
+        now = max(float(change[0:2] @ change[0:2]) - GRAVITY**2 * float(np.trace(drift)), 0.0) * 0.3
         self._unsteady += 0.2 * (now - self._unsteady)
-        hidden = abs(float(mean_n @ mean_n) - self._size**2)
+        heave = 0.0
+        if self._last is not None:
+            heave = 0.6 * float(change[2]) ** 2
+            self._heaving += 0.2 * (heave - self._heaving)
+        self._last = means_i[:, 0]
+        hidden = size**2 - GRAVITY**2  # what a level acceleration adds
+        doubt = 2.0 * GRAVITY * HEAVES * math.sqrt(size_variance + max(self._heaving, heave))
         lasting = max(2.0 * HIDDEN_TIME / span, 1.0)
-        along = across = max(hidden - self._doubt, 0.0)
-        if speed.known:
-            turning = float(parts[:, 12] @ parts[:, 12] / (times @ times))
-            along = min(hidden + self._doubt, speed.acceleration_variance)
-            across = min(hidden + self._doubt, turning * speed.speed_variance)
-        known = self._bias_std**2 + max(self._unsteady, now)
-        return Gravity(mean_n, known + lasting * along, known + lasting * across, lever)
+        turning = float(parts[:, 75] @ parts[:, 75] / (times @ times))
+        along = across = max(hidden - doubt, 0.0)
+        if not speed.known:
+            curve = _lasting_turn(parts[:, 75], times)
+            self._curves = self._curves + 1 if curve > 0.0 else 0
+            across += self._curves * min(curve * ANY_SPEED**2, doubt)  # the same error every time
+        else:
+            seen = 4.0 * math.pi**2 * SPEED_TIME / (2.0 * span) ** 3 * speed.speed_variance
+            along = min(max(hidden, 0.0) + doubt, speed.acceleration_variance, seen / lasting)
+            across = min(max(hidden, 0.0) + doubt, turning * speed.speed_variance)
+        known = FLOOR**2 + max(self._unsteady, now)
+        variances = known + lasting * along, known + lasting * across
+        down = known if attitude.resting else math.inf
+        return Gravity(means_n[:, 0], *variances, down, lever, by_errors)
+
+
+def _lasting_turn(turns: Floats, times: Floats) -> float:
+    """Square of a rate that lasts as that of a vehicle in a curve does, (rad/s)^2; 0: it does not.
+
+    It changes little, and in the time of a mean it makes less than half a turn.
+    """
+    turned, time = float(turns.sum()), float(times.sum())
+    mean = turned / time
+    spread = float(((turns / times - mean) ** 2).mean())
+    return mean**2 if 4.0 * spread < mean**2 and abs(turned) < math.pi else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,8 +234,7 @@ class Rest:
 
     rate_b: Floats  # (3,) rad/s
     variance: Floats  # (3,) (rad/s)^2
-    size: float  # m/s^2, of the specific force; NaN: there is no accelerometer
-    confirmed: bool  # by GPS
+    confirmed: bool  # by GPS, or by gravity that does not turn
 
 
 class RestFinder:
@@ -265,21 +301,24 @@ class RestFinder:
         if self._still < (STILL if standing else STILL_ON_ROAD if speed.known else STILL_ALONE):
             return None
         floor = REST_RATE if standing else UNCONFIRMED_RATE
-        size = float(np.linalg.norm(mean[3:])) if axes > 3 else math.nan
-        return Rest(mean[:3], np.maximum(noise, variance)[:3] / n + floor**2, size, standing)
+        spread = np.maximum(noise, variance)[:3] / n + floor**2
+        return Rest(mean[:3], spread, standing or self._contradicts(mean))
+
+    def _contradicts(self, mean: Floats) -> bool:
+        """Whether gravity, which stood still, would have turned by what the rate claims."""
+        if len(mean) < 6 or self._still < STILL_BY_GRAVITY:
+            return False
+        rate, force = float(np.linalg.norm(mean[:3])), float(np.linalg.norm(mean[3:]))
+        claimed = float(np.linalg.norm(np.cross(mean[:3], mean[3:])))
+        return claimed > max(LEVEL_PART * rate, CLAIMED_TURN / self._still) * force
 
 
 class Aiding:
-    """Feeds a filter with what the array and the speed tell of gravity and rest.
+    """Feeds a filter with what the array and the speed tell of gravity and rest."""
 
-    Parameters
-    ----------
-    parameters : AttitudeParameters
-    """
-
-    def __init__(self, parameters: AttitudeParameters) -> None:
+    def __init__(self) -> None:
         self.speed = SpeedTracker()
-        self._gravity = GravityFinder(parameters.accel_bias_std)
+        self._gravity = GravityFinder()
         self._rest = RestFinder()
 
     def take(
@@ -307,8 +346,6 @@ class Aiding:
         rest = self._rest.take(fused.rate_b, force_b, dt, self.speed)
         if rest is not None:
             corrections += attitude.correct_zero_rate(rest.rate_b, rest.variance, rest.confirmed)
-            if corrections[0].fused:
-                self._gravity.learn_size(rest.size)
         gravity = self._gravity.take(attitude, force_b, dt, self.speed)
         if gravity is not None:
             corrections += attitude.correct_gravity(gravity)

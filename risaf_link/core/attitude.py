@@ -49,8 +49,10 @@ class AttitudeParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """`eskf`: rad/s/sqrt(Hz), that no averaging takes away: vibration, the board's own motion."""
     common_bias_walk: Annotated[float, Meta(ge=0)] = 5e-7
     """`eskf`: rad/s/sqrt(s), of all sensors together: the board's temperature."""
-    turn_error: Annotated[float, Meta(ge=0)] = 2e-3
-    """`eskf`: rad for each sqrt(rad) turned: scale factor and misalignment after calibration."""
+    scale_std: Annotated[float, Meta(ge=0)] = 5e-3
+    """`eskf`: scale factor and misalignment, rad, that calibration left: 0.5 %, 0.3 deg."""
+    turn_error: Annotated[float, Meta(ge=0)] = 3e-4
+    """`eskf`: rad for each sqrt(rad) turned: what of the rate's error is not linear."""
     accel_bias_std: Annotated[float, Meta(gt=0)] = 0.05
     """`eskf`: m/s^2: 5 mg, of an accelerometer calibrated once; it tilts the apparent vertical by
     0.3 deg."""

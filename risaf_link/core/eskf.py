@@ -1,10 +1,14 @@
 """FusedRate -> AttitudeState: an error-state filter on SO(3), aided by heading, gravity and rest.
 
-The error is a small rotation in the navigation frame, `R_nb = exp(angle_n) R_nb_estimated`, and the
-error of the gyro bias (Sola, "Quaternion kinematics for the error-state Kalman filter",
-arXiv:1711.02508, chapter 7: global angular errors). In that frame
+The error is a small rotation in the navigation frame, `R_nb = exp(angle_n) R_nb_estimated` (Sola,
+"Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, chapter 7: global
+angular errors), and what makes the readings of gyros and accelerometers wrong and stays as it is:
+bias, scale and misalignment. What is constant is a state, no noise: an error of scale grows with
+the angle turned and goes with turning back, and no number of measurements averages it away. In the
+navigation frame
 
-- the error stays as it is while the body turns: only the bias drives it, `-R_nb bias`;
+- the error stays as it is while the body turns: only the gyro's errors drive it,
+  `-R_nb (bias + scale rate)`;
 - gravity sees the angles about north and east, never that about down, whatever the attitude: yaw,
   which is not observed before the first heading, cannot leak into the tilt (Barrau and Bonnabel,
   "Intrinsic filtering on Lie groups with applications to attitude estimation", arXiv:1310.2539);
@@ -19,7 +23,7 @@ turns show.
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -33,12 +37,15 @@ from risaf_link.core.rotation import Floats, wrap
 
 ATTITUDE = slice(0, 3)  # error: rotation vector, rad, NED
 BIAS = slice(3, 6)  # error of the fused rate's bias, rad/s, body
-HEADING = slice(6, 8)  # what is wrong with the headings:
-OFFSET = 6  # rad, by which all of them are off: antennas, a crabbing vehicle
-LATE = 7  # s, by which they are later than told
+SCALE = slice(6, 15)  # error of the matrix that the rate is too large by, row by row
+GYRO = slice(3, 15)  # both
+ACCELEROMETER = slice(15, 27)  # the same of the accelerometers: m/s^2, body; 9 of the matrix
+HEADING = slice(27, 29)  # what is wrong with the headings:
+OFFSET = 27  # rad, by which all of them are off: antennas, a crabbing vehicle
+LATE = 28  # s, by which they are later than told
+STATES = 29
 DOWN = 2
-LEVEL, BIAS_AXES, HEADING_AXES = np.arange(2), np.arange(3, 6), np.arange(6, 8)  # for diagonals
-STATES = 8
+LEVEL, BIAS_AXES, HEADING_AXES = np.arange(2), np.arange(3, 6), np.arange(27, 29)  # for diagonals
 IDENTITY = np.eye(STATES)
 
 HISTORY = 1024  # epochs; a second at 1 kHz
@@ -92,8 +99,11 @@ class Gravity:
     gravity_n: Floats  # (3,) m/s^2, by the filter's attitude; (0, 0, g) if that is right
     forward: float  # (m/s^2)^2, variance of its part along the vehicle's heading
     right: float  # (m/s^2)^2, variance of its part across
-    lever: Floats = field(default_factory=lambda: np.zeros((3, 3)))
-    """s: integral of `R_nb` from the time of the measurement; by it the bias has turned since."""
+    down: float = math.inf  # (m/s^2)^2, of its size; infinite: not known
+    lever: Floats = field(default_factory=lambda: np.zeros((3, 12)))
+    """Integral of `drive` from the time of the measurement: what the gyro's errors turned since."""
+    by_errors: Floats = field(default_factory=lambda: np.zeros((3, 12)))
+    """What the accelerometers' errors make of it."""
 
 
 class Eskf:
@@ -115,13 +125,19 @@ class Eskf:
         self._by_rate: Quaternion = (1.0, 0.0, 0.0, 0.0)  # the rate's integral alone
         self._correction: Quaternion = (1.0, 0.0, 0.0, 0.0)  # on its left: q_nb is their product
         self._bias = np.zeros(3)
+        self._scale = np.zeros((3, 3))
+        self._force_errors = np.zeros(12)
         self._rate = np.zeros(3)
+        self._drive_ib = drive(np.eye(3), self._rate)
         self._unseen = np.zeros(3)  # s, each axis, since its rate was known
         self._turned: Vector = (0.0, 0.0, 0.0)  # rotation vector of the last step
         tilt = p.initial_tilt_std**2
         bias = p.initial_bias_std**2
+        scale, force = p.scale_std**2, p.accel_bias_std**2
         wrong = [heading.offset_std**2, heading.delay_std**2]
-        self._covariance = np.diag([tilt, tilt, math.pi**2, bias, bias, bias, *wrong])
+        self._covariance = np.diag(
+            [tilt, tilt, math.pi**2] + [bias] * 3 + [scale] * 9 + [force] * 3 + [scale] * 9 + wrong
+        )
         self._wrong = np.zeros(2)  # what the headings are held to be off by: rad, s
         self._wrong_variance = np.array(wrong)  # that it comes back to
         self._latitude = math.nan
@@ -154,6 +170,11 @@ class Eskf:
         return _matrix(self._by_rate)
 
     @property
+    def drive_ib(self) -> Floats:
+        """How the errors of `GYRO` turn `R_ib` in a second, amid the last step, (3, 12)."""
+        return self._drive_ib
+
+    @property
     def matrix_ni(self) -> Floats:
         """`R_ni`: all corrections, and the earth's rotation, until now."""
         return _matrix(self._correction)
@@ -164,7 +185,24 @@ class Eskf:
         return self._rate
 
     @property
-    def _at_rest(self) -> bool:
+    def levelled(self) -> bool:
+        """Whether gravity has set the tilt."""
+        return self._levelled
+
+    @property
+    def up_b(self) -> Floats:
+        """The vertical in body axes, upwards, (3,): where the force points that holds it."""
+        x, y, z = self.matrix[DOWN].tolist()
+        return np.array([-x, -y, -z])
+
+    @property
+    def known_errors(self) -> Floats:
+        """What is known of the readings' errors, (24,): `GYRO`, then `ACCELEROMETER`."""
+        return np.concatenate((self._bias, self._scale.ravel(), self._force_errors))
+
+    @property
+    def resting(self) -> bool:
+        """Whether rest was found, and fused, a moment ago."""
         return self._elapsed - self._rested < LARGEST_GAP
 
     @property
@@ -173,14 +211,8 @@ class Eskf:
 
     @property
     def covariance(self) -> Floats:
-        """Covariance of the error of attitude and bias, (6, 6): `ATTITUDE`, `BIAS`.
-
-        That of the accelerometers' bias, which no correction takes away, is added to the tilt.
-        """
-        covariance = self._covariance[:6, :6].copy()
-        if self._levelled:
-            covariance[LEVEL, LEVEL] += (self._parameters.accel_bias_std / GRAVITY) ** 2
-        return covariance
+        """Covariance of the error, (29, 29): `ATTITUDE`, `GYRO`, `ACCELEROMETER`, `HEADING`."""
+        return self._covariance.copy()
 
     def predict(self, fused: FusedRate, dt: float) -> None:
         """Carry the state on to the time of a fused rate.
@@ -202,16 +234,17 @@ class Eskf:
         dt = min(dt, LARGEST_STEP)
         known = np.abs(fused.rate_b) < LARGEST_RATE  # false for NaN
         held = np.where(self._unseen < LONG_STEP, self._rate, 0.0)
-        self._rate = np.where(known, fused.rate_b - self._bias, held)
+        read = np.where(known, fused.rate_b - self._bias, held)
+        self._rate = np.where(known, read - self._scale @ read, held)
         unseen = self._see(known, dt)
-        before = self._attitude
-        self._by_rate = _unit(_product(self._by_rate, _exp(self._rotation(dt))))
+        before = self._by_rate
+        self._by_rate = _unit(_product(before, _exp(self._rotation(dt))))
+        self._drive_ib = drive(_matrix(_between(before, self._by_rate, 0.5)), self._rate)
         x, y, z = self._earth_rate()
         self._turn((-x * dt, -y * dt, -z * dt))
         self._elapsed += dt
         self._history.append((self._elapsed, self._by_rate))
-        matrix_nb = _matrix(_between(before, self._attitude, 0.5))
-        self._spread(matrix_nb, fused, unseen, dt)
+        self._spread(self.matrix_ni @ self._drive_ib, fused, unseen, dt)
 
     def compare_heading(
         self, heading: float, variance: float, age: float, gate: float
@@ -285,7 +318,8 @@ class Eskf:
         A tilt that gravity contradicts for `gravity_distrust` seconds is doubted: its variance
         becomes as large as the contradiction.
         """
-        north, east, down = (float(part) for part in gravity.gravity_n)
+        gravity_n = gravity.gravity_n + gravity.by_errors @ self._force_errors
+        north, east, down = gravity_n.tolist()
         gate = self._parameters.gate
         level, size = math.hypot(north, east), math.hypot(north, east, down)
         sound = 0.1 * GRAVITY < size < LARGEST_FORCE
@@ -293,21 +327,20 @@ class Eskf:
             return (Correction(size, 1.0, gate, False, "gravity", Outcome.NOT_FINITE),)
         # The rotation vector that takes the measured vertical to down: its axis is level.
         angle = math.atan2(level, down) / level if level > 1e-9 * size else 1.0 / size
-        about_n = np.array([east * angle, -north * angle])
+        about_n = (east * angle, -north * angle)
         scale = 1.0 / size**2
-        if not self._levelled:
-            return self._level(about_n, max(gravity.forward, gravity.right) * scale)
-        yaw = _yaw(self._attitude)
-        rows = np.zeros((2, STATES))
-        rows[:, 0:2] = [[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]
-        rows[:, BIAS] = rows[:, ATTITUDE] @ gravity.lever
-        errors = [float(row[0:2] @ about_n) for row in rows]
         variances = [gravity.right * scale, gravity.forward * scale]
-        corrections = self._fuse_all("gravity", tuple(rows), errors, variances, gate)
-        patience = 0.0 if self._at_rest else self._parameters.gravity_distrust
+        if not self._levelled:
+            return self._level(about_n, gravity, variances)
+        rows = _level_rows(_yaw(self._attitude), gravity, size)
+        errors = [float(row[0] * about_n[0] + row[1] * about_n[1]) for row in rows]
+        corrections = self._fuse_all("gravity", rows, errors, variances, gate)
+        patience = 0.0 if self.resting else self._parameters.gravity_distrust
         if self._distrusts("gravity", patience):
             self._covariance[LEVEL, LEVEL] += errors[0] ** 2 + errors[1] ** 2
-            return self._fuse_all("gravity", tuple(rows), errors, variances, gate)
+            corrections = self._fuse_all("gravity", rows, errors, variances, gate)
+        if corrections[0].fused and gravity.down < LARGEST_FORCE**2:
+            self._learn_size(gravity)
         return corrections
 
     def correct_zero_rate(
@@ -320,7 +353,7 @@ class Eskf:
         rate_b, variance : ndarray, shape (3,)
             Mean of the fused rate, bias not taken off, rad/s, and its variance.
         confirmed : bool
-            Whether GPS says that the vehicle stands. Then a bias that is contradicted for
+            Whether GPS or gravity says that it stands. Then a bias that is contradicted for
             `distrust` seconds is doubted.
         """
         p = self._parameters
@@ -342,7 +375,7 @@ class Eskf:
         """Read the estimate as of the last predict."""
         q_nb = self.quaternion
         matrix_nb = self.matrix
-        rows = np.array([*_tilt_rows(matrix_nb), _yaw_row(matrix_nb, 0.0)[ATTITUDE]])
+        rows = np.array([*_tilt_rows(matrix_nb), _yaw_row(matrix_nb, self._rate, 0.0)[ATTITUDE]])
         variance = ((rows @ self.covariance[ATTITUDE, ATTITUDE]) * rows).sum(axis=1)
         roll, pitch, yaw = np.minimum(np.sqrt(variance), math.pi).tolist()
         return AttitudeState(
@@ -380,19 +413,23 @@ class Eskf:
         self._unseen[known] = 0.0
         return variance
 
-    def _spread(self, matrix_nb: Floats, fused: FusedRate, unseen: Floats, dt: float) -> None:
-        """Carry the covariance on: `angle' = angle - R_nb dt bias`, and the noise of both."""
+    def _spread(self, drive_nb: Floats, fused: FusedRate, unseen: Floats, dt: float) -> None:
+        """Carry the covariance on: `angle' = angle - drive dt gyro`, and the noise of both."""
         angle, walk = self._noise(fused, unseen, dt)
-        transition = IDENTITY.copy()
-        transition[ATTITUDE, BIAS] = matrix_nb * -dt
+        matrix_nb = drive_nb[:, 0:3]
+        turned_nb = drive_nb * dt
+        covariance = self._covariance
+        covariance[ATTITUDE] -= turned_nb @ covariance[GYRO]
+        among = covariance[ATTITUDE, ATTITUDE] - covariance[ATTITUDE, GYRO] @ turned_nb.T
+        among += (matrix_nb * angle) @ matrix_nb.T
+        covariance[ATTITUDE, ATTITUDE] = (among + among.T) / 2.0
+        covariance[3:, ATTITUDE] = covariance[ATTITUDE, 3:].T
         kept = np.exp([-dt / OFFSET_TIME, -dt / LATE_TIME])
-        transition[HEADING_AXES, HEADING_AXES] = kept
         self._wrong = self._wrong * kept
-        covariance = transition @ self._covariance @ transition.T
+        covariance[HEADING] *= kept[:, np.newaxis]
+        covariance[:, HEADING] *= kept
         covariance[HEADING_AXES, HEADING_AXES] += self._wrong_variance * (1.0 - kept * kept)
-        covariance[ATTITUDE, ATTITUDE] += (matrix_nb * angle) @ matrix_nb.T
         covariance[BIAS_AXES, BIAS_AXES] += walk
-        self._covariance = (covariance + covariance.T) / 2.0
         self._bound()
 
     def _noise(
@@ -432,19 +469,35 @@ class Eskf:
             matrix_nb = self.matrix
             self._covariance[BIAS, BIAS] += level * (matrix_nb.T * [1.0, 1.0, 0.0]) @ matrix_nb
 
-    def _level(self, about_n: Floats, variance: float) -> tuple[Correction, ...]:
-        """Set the tilt, whatever it was; yaw and the bias stay."""
+    def _level(
+        self, about_n: tuple[float, float], gravity: Gravity, variances: Sequence[float]
+    ) -> tuple[Correction, ...]:
+        """Set the tilt, whatever it was; yaw and all else stay."""
         gate = self._parameters.gate
-        spreads = (self._covariance.diagonal()[0:2] + variance).tolist()
-        self._turn((float(about_n[0]), float(about_n[1]), 0.0))
+        spreads = (self._covariance.diagonal()[LEVEL] + variances).tolist()
+        self._turn((*about_n, 0.0))
         for axis in (0, 1):
             self._covariance[axis, :] = self._covariance[:, axis] = 0.0
-            self._covariance[axis, axis] = min(variance, math.pi**2)
+            self._covariance[axis, axis] = math.pi**2
+        turned = _matrix(_exp((*about_n, 0.0)))
+        upright = replace(
+            gravity, lever=turned @ gravity.lever, by_errors=turned @ gravity.by_errors
+        )
+        for row in _level_rows(0.0, upright, GRAVITY):
+            self._gain(row, max(variances))
         self._levelled = True
         return tuple(
-            Correction(float(error), spread, gate, True, "gravity", Outcome.RESET)
+            Correction(error, spread, gate, True, "gravity", Outcome.RESET)
             for error, spread in zip(about_n, spreads, strict=True)
         )
+
+    def _learn_size(self, gravity: Gravity) -> None:
+        """Find the accelerometers' bias along the vertical: what their reading is too large by."""
+        row = np.zeros(STATES)
+        row[ACCELEROMETER] = -gravity.by_errors[DOWN]
+        size = float(np.linalg.norm(gravity.gravity_n + gravity.by_errors @ self._force_errors))
+        gate = self._parameters.gate
+        self._fuse_all("size", (row,), (size - GRAVITY,), (gravity.down,), gate)
 
     def _turn(self, angle_n: Vector) -> None:
         """Turn the attitude, and with it its history, about axes of NED."""
@@ -474,6 +527,8 @@ class Eskf:
                 change += self._gain(row, variance) * (error - float(row @ change))
             self._turn((float(change[0]), float(change[1]), float(change[2])))
             self._bias = self._bias + change[BIAS]
+            self._scale = self._scale + change[SCALE].reshape(3, 3)
+            self._force_errors = self._force_errors + change[ACCELEROMETER]
             self._wrong = self._wrong + change[HEADING]
         outcome = Outcome.FUSED if passed else Outcome.REJECTED
         return tuple(
@@ -508,7 +563,7 @@ class Eskf:
         return last == self._elapsed and last - began >= after
 
     def _by_heading(self, heading: float, age: float) -> tuple[Floats | None, float]:
-        """Derivative of a heading by the error, (8,), and the innovation.
+        """Derivative of a heading by the error, (29,), and the innovation.
 
         None while the vehicle points up or down: it says nothing of yaw.
         """
@@ -518,7 +573,7 @@ class Eskf:
         error = wrap(heading - float(self._wrong[0]) - yaw_then)
         if abs(matrix_then[2, 0]) > STEEP:
             return None, error
-        row = _yaw_row(matrix_then, age)
+        row = _yaw_row(matrix_then, self._rate, age)
         row[HEADING] = 1.0, -self._yaw_rate_before(age)
         return row, error
 
@@ -554,19 +609,45 @@ def _usable(heading: float, variance: float, age: float) -> bool:
     return math.isfinite(heading) and 0 < variance < math.inf and 0 <= age < math.inf
 
 
-def _yaw_row(matrix_nb: Floats, age: float) -> Floats:
-    """Yaw's derivative by the error, `age` after the attitude, shape (8,).
+def drive(matrix: Floats, reading_b: Floats) -> Floats:
+    """What the errors of a triad make of its reading in another frame, shape (3, 12).
+
+    A bias `b` and a matrix `M`, row by row, make the reading too large by `b + M reading`.
+    """
+    by_errors = np.empty((3, 12))
+    by_errors[:, 0:3] = matrix
+    by_errors[:, 3:] = (matrix[:, :, np.newaxis] * reading_b).reshape(3, 9)
+    return by_errors
+
+
+def _yaw_row(matrix_nb: Floats, rate_b: Floats, age: float) -> Floats:
+    """Yaw's derivative by the error, `age` after the attitude, shape (29,).
 
     With the forward axis x: `d yaw = angle_D - x_D (x_N angle_N + x_E angle_E) / (x_N^2 + x_E^2)`;
-    the angle of then is that of now and what the bias has done since.
+    the angle of then is that of now and what the gyro's errors have done since.
     """
     row = np.zeros(STATES)
     row[DOWN] = 1.0
     north, east, down = matrix_nb[:, 0].tolist()
     level = max(north * north + east * east, 1.0 - STEEP**2)
     row[0], row[1] = -down * north / level, -down * east / level
-    row[BIAS] = row[ATTITUDE] @ matrix_nb * age
+    row[GYRO] = row[ATTITUDE] @ drive(matrix_nb, rate_b) * age
     return row
+
+
+def _level_rows(yaw: float, gravity: Gravity, size: float) -> tuple[Floats, Floats]:
+    """Derivatives of what gravity shows about the heading and across it, shape (29,) each.
+
+    That is the angle at the time of the measurement, and what a bias of the accelerometers leans:
+    `angle_N - (R_nb bias)_E / g`, `angle_E + (R_nb bias)_N / g`.
+    """
+    about = np.zeros((2, STATES))
+    about[0, 0] = about[1, 1] = 1.0
+    about[:, GYRO] = gravity.lever[0:2]
+    about[0, ACCELEROMETER] = gravity.by_errors[1] / -size
+    about[1, ACCELEROMETER] = gravity.by_errors[0] / size
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    return cosine * about[0] + sine * about[1], cosine * about[1] - sine * about[0]
 
 
 def _tilt_rows(matrix_nb: Floats) -> tuple[Floats, Floats]:

@@ -43,6 +43,10 @@ class FusionParameters(Struct, frozen=True, forbid_unknown_fields=True):
     A longer one costs the sensors that are hit often: at 20 s most never come back."""
     resolution: Annotated[float, Meta(ge=0)] = 3e-4
     """`robust`: rad/s; no sensor is blamed for less: several counts' worth of rounding."""
+    scale_error: Annotated[float, Meta(ge=0)] = 5e-3
+    """`robust`: standard deviation of scale factor and misalignment: no sensor is blamed for so
+    much of the rate, times the gate. 0.5 %: a consumer gyro, not calibrated; few sensors do not
+    show it themselves."""
     alpha: Annotated[float, Meta(ge=0, lt=1)] = 0.995
     """`risaf`, eq. 5: memory of a relative bias, an epoch."""
     lower_quantile: Annotated[float, Meta(ge=0, le=0.5)] = 0.20
@@ -175,9 +179,6 @@ class Median:
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch, by their silence alone."""
         return self._silence.health()
-
-
-FUSIONS: dict[str, type[Risaf | Mean | Median]] = {"risaf": Risaf, "mean": Mean, "median": Median}
 
 
 def quantiles(values: Floats, shares: tuple[float, ...]) -> Floats:

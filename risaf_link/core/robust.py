@@ -24,7 +24,7 @@ A channel is on the jury if it is valid and trusted; r_i is its reading less its
 3. Watch. z_i, the residuals inside low-passed, shows what no single reading does: a burst's tail, a
    step, a drift, a scale. Alarms are |z_i - median z| beyond gate times the scaled median absolute
    deviation of all z; more than `BURST` of the readings of a second rejected; a reading that does
-   not change while most others do; silence. The median and deviation are those of all channels that
+   not change although it should; silence. The median and deviation are those of all channels that
    change, trusted or not: however many are out, the bar does not close in on the rest.
 4. Trust. A channel is trusted once it has been `hold_time` without an alarm. One that has not been
    trusted for `RELEARN` is taken to have changed for good, and learns its bias anew, as a new one
@@ -33,7 +33,8 @@ A channel is on the jury if it is valid and trusted; r_i is its reading less its
 If less than half of the valid channels, or less than three, are trusted, all that change are the
 jury, or if none does, all that are valid; it is active itself only where none of the trusted is
 inside. One or two sensors have no majority: their mean is taken, and neither is blamed but for
-silence or a reading that does not change.
+silence or a reading that does not change. Of few sensors, scale factors and misalignments that are
+usual are no reason for blame (`scale_error`): they do not show themselves how far they differ.
 
 How certain the rate is
 -----------------------
@@ -43,9 +44,10 @@ How certain the rate is
 residuals, but hardly changes from one epoch to the next.
 `bias_walk` is how quickly the bias of the rate wanders, rad/s/sqrt(s). If a channel's bias walks
 by q, then V = q^2 T^2 / (2 (T + S)) + s^2 dt T / (2 S (T + S)), S the time constant of z, T at
-first two thirds of the time since the start; solved for q it gives q / sqrt(active). Each of c
-channels that have come or gone since the last epoch has moved the rate by about sqrt(V) / (active):
-c V / (active)^2 / dt is added to the square. A filter adds `noise * dt**2` to the angles'
+first two thirds of the time since the start; solved for q^2 and averaged over calm times, since in
+turns z shows scale factors as well, it gives q / sqrt(active). Each of c channels that have come or
+gone since the last epoch has moved the rate by about sqrt(V) / (active): c V / (active)^2 / dt is
+added to the square. A filter adds `noise * dt**2` to the angles'
 covariance and `bias_walk**2 * dt` to that of the bias of the rate.
 What all sensors have in common (the mean's bias at the start, its temperature, vibration rectified
 alike) no residual shows: the filter has to add what it knows of that.
@@ -90,13 +92,16 @@ Scale", 1992."""
 class Channels:
     """What is remembered of each channel, shape (3, n); times in s."""
 
-    reading: Floats  # the last one
+    reading: Floats  # the last valid one
+    count: Floats  # the smallest change of it
+    residual: Floats  # the last one, rad/s; 0 where not active
     bias: Floats  # relative, rad/s
     age: Floats  # how long the bias has been learnt
     slow: Floats  # z: low-passed residual, rad/s
     rejected: Floats  # share of its readings, of about a second
     unchanged: Floats  # for how long the reading has been
-    frozen: Floats  # 1: it does not, and most others do
+    moved: Floats  # by how much the array's rate has since, rad/s
+    frozen: Floats  # 1: it should have changed
     silent: Floats  # for how long
     calm: Floats  # since the last alarm
     out: Floats  # since it was last trusted
@@ -107,6 +112,7 @@ class Channels:
         """Make n sensors of which nothing is known: they are learnt like those that are back."""
         channels = cls(*(np.zeros((3, n)) for _ in fields(cls)))
         channels.reading += np.nan
+        channels.count += np.nan
         channels.out += RELEARN
         return channels
 
@@ -133,6 +139,11 @@ class Robust:
         self._elapsed = 0.0  # s
         self._spread = np.zeros((3, 1))  # s, robust standard deviation of one reading
         self._slow_spread = np.zeros((3, 1))  # that of z
+        self._centre = np.zeros((3, 1))
+        self._turning = np.zeros((3, 1))  # the centre, low-passed as z is
+        self._jitter = np.zeros((3, 1))  # standard deviation of what changes from epoch to epoch
+        self._calm = 0.0  # how calmly the array turned of late, 0 to 1
+        self._calm_walk = np.zeros(3)  # that times the square of a sensor's bias walk
         self._noise = np.full(3, np.nan)  # variance of one active reading
 
     @property
@@ -141,20 +152,8 @@ class Robust:
         return self._channels.bias.T.copy()
 
     def health(self) -> ArrayHealth:
-        """Judge the sensors as of the last epoch; of a sensor, its worst axis counts.
-
-        Dead: frozen, or for a second silent, or for a minute not trusted.
-        """
-        c = self._channels
-        reason = np.where(self._trusted, Reason.NONE, Reason.SETTLING).astype(np.int8)
-        reason[c.wandering > 0] = Reason.WANDERING
-        reason[c.rejected > BURST] = Reason.OUTLYING
-        reason[c.frozen > 0] = Reason.FROZEN
-        reason[c.silent > 0] = Reason.SILENT
-        worst = reason.max(axis=0)
-        dead = (c.frozen > 0) | (c.silent > SILENT_AFTER) | (c.out > DEAD_AFTER)
-        state = np.where(dead.any(axis=0), SensorState.DEAD, worst > Reason.NONE).astype(np.int8)
-        return ArrayHealth(state, worst, c.rejected.max(axis=0), self.relative_bias)
+        """Judge the sensors as of the last epoch; of a sensor, its worst axis counts."""
+        return judge(self._channels, self._trusted)
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
@@ -184,7 +183,8 @@ class Robust:
         centre = _median(corrected, jury)
         offset = corrected - centre
         distance = np.abs(offset)
-        inside = (distance <= self._limit(distance, jury, dt)) & valid
+        self._note_turning(centre, dt)
+        inside = (distance <= self._limit(distance, jury, centre, dt)) & valid
         active = trusted & inside
         count = active.sum(axis=1)
         if not count.all():  # where none of the trusted is inside, the rest of the jury
@@ -213,31 +213,52 @@ class Robust:
     def _note_changes(self, readings: Floats, valid: Bools, dt: float) -> Bools:
         """Which channels are valid and not frozen.
 
-        Frozen is what does not change while most others of its axis do: a vehicle at rest and
-        coarse counts look alike to all.
+        Frozen is what does not change although there was reason to: the array has moved by two
+        counts since, or its noise is more than half a count (rounding alone makes 0.29). What no
+        noise and no motion makes change, such as coarse counts at rest, is not frozen.
         """
         c = self._channels
-        c.unchanged += dt
-        c.unchanged *= readings == c.reading
+        change = np.abs(readings - c.reading)
+        changed = valid & (change > 0.0)  # false for the first
+        c.count = np.where(changed, np.fmin(c.count, change), c.count)
+        c.unchanged += dt * valid
+        c.unchanged *= ~changed
         c.silent += dt
         c.silent *= ~valid
-        c.reading = readings
-        still = valid & (c.unchanged > FROZEN_AFTER)
-        most = 2 * still.sum(axis=1) <= valid.sum(axis=1)
-        c.frozen[:] = still & most[:, None]
+        c.reading = np.where(valid, readings, c.reading)
+        count = np.fmax(c.count, self._parameters.resolution)
+        reason = (np.abs(c.moved) > 2.0 * count) | (2.0 * self._jitter > count) | (c.frozen > 0.0)
+        c.frozen[:] = valid & (c.unchanged > FROZEN_AFTER) & reason
         changing: Bools = valid & (c.frozen == 0.0)
         return changing
 
-    def _limit(self, distance: Floats, jury: Bools, dt: float) -> Floats:
+    def _note_turning(self, centre: Floats, dt: float) -> None:
+        """Keep account of how the centre moves, shape (3, 1)."""
+        c = self._channels
+        c.moved += centre - self._centre
+        c.moved *= c.unchanged > 0.0
+        self._centre = centre
+        self._turning += dt / WATCH_TIME * (centre - self._turning)
+
+    def _unscaled(self, rate: Floats) -> float:
+        """By how much a sound sensor may differ at a rate (3, 1), one standard deviation.
+
+        Many sensors show how their scale factors differ; few are judged by what is usual.
+        """
+        believed = PRIOR / (PRIOR + self._trusted.shape[1])
+        return self._parameters.scale_error * math.sqrt(believed * float((rate**2).sum()))
+
+    def _limit(self, distance: Floats, jury: Bools, centre: Floats, dt: float) -> Floats:
         """How far from the centre of the jury a reading is inside; shape (3, 1)."""
         p = self._parameters
-        usual = np.maximum(self._spread, p.resolution)
+        least = math.hypot(p.resolution, self._unscaled(centre))
+        usual = np.maximum(self._spread, least)
         spread = _deviation(distance, jury)
         if self._elapsed > 0:
             spread = np.minimum(spread, SWELL * usual)
         self._spread += self._share(dt, NOISE_TIME) * (spread - self._spread)
         nearest = np.where(jury, distance, np.inf).min(axis=1, initial=np.inf, keepdims=True)
-        widest = np.maximum(np.maximum(spread, self._spread), p.resolution)
+        widest = np.maximum(np.maximum(spread, self._spread), least)
         limit: Floats = np.maximum(p.gate * widest, nearest)
         return limit
 
@@ -250,6 +271,11 @@ class Robust:
         known = np.where(np.isnan(self._noise), square, self._noise)
         averaged = known + self._share(dt, NOISE_TIME) * (square - known)
         self._noise = np.where(count > 1, averaged, self._noise)
+        c = self._channels
+        change = residual - c.residual
+        c.residual = residual
+        size = np.sqrt(np.einsum("ij,ij->i", change, change) / np.maximum(2 * count, 1))[:, None]
+        self._jitter += self._share(dt, SPREAD_TIME) * (size - self._jitter)
 
     def _learn(self, residual: Floats, active: Bools, changing: Bools, dt: float) -> None:
         """Let relative biases follow the residuals: the trusted if active, the new always."""
@@ -271,8 +297,10 @@ class Robust:
         white = self._spread * math.sqrt(dt / (2 * WATCH_TIME))
         spread = np.maximum(_deviation(distance, changing), white)
         self._slow_spread += self._share(dt, SPREAD_TIME) * (spread - self._slow_spread)
-        widest = np.maximum(spread, self._slow_spread)
-        np.greater(distance, self._parameters.gate * widest, out=c.wandering)
+        p = self._parameters
+        limit = p.gate * np.maximum(spread, self._slow_spread)
+        least = math.hypot(p.resolution, p.gate * self._unscaled(self._turning))
+        np.greater(distance, np.maximum(limit, least), out=c.wandering)
 
     def _trust(self, dt: float) -> NDArray[np.int64]:
         """Judge every channel anew; how many of each axis have come or gone."""
@@ -301,6 +329,17 @@ class Robust:
         square: Floats = np.einsum("ij,ij->i", slow, slow) / np.maximum(count - 1, 1)
         return square
 
+    def _averaged_walk(self, walk: Floats, dt: float) -> Floats:
+        """Average over `SPREAD_TIME`, in which a turn counts little: scale factors show there."""
+        scale = self._parameters.scale_error * float(np.linalg.norm(self._turning))
+        least = max(self._parameters.resolution, TINY)
+        calm = 1.0 / (1.0 + (scale / least) ** 2)
+        share = dt / min(max(self._elapsed / 3.0, dt), SPREAD_TIME) if dt > 0 else 0.0
+        self._calm += share * (calm - self._calm)
+        self._calm_walk += share * (calm * walk - self._calm_walk)
+        average: Floats = self._calm_walk / max(self._calm, TINY)
+        return average
+
     def _bias_walk(
         self, white: Floats, slow: Floats, count: Floats, moved: NDArray[np.int64], dt: float
     ) -> Floats:
@@ -309,6 +348,7 @@ class Robust:
         time = min(max(2 / 3 * self._elapsed, WATCH_TIME), p.bias_time)
         noise = np.where(np.isnan(white), 0.0, white)
         walk = 2 * (time + WATCH_TIME) / time**2 * slow - dt / (WATCH_TIME * time) * noise
+        walk = self._averaged_walk(np.where(np.isnan(walk), 0.0, walk), dt)
         told = count - 1  # one sensor has no residual
         walk = (PRIOR * p.bias_walk**2 + told * np.maximum(walk, 0.0)) / (PRIOR + told)
         if dt > 0 and moved.any():
@@ -329,6 +369,23 @@ class Robust:
             self._channels.calm += self._parameters.hold_time
             self._channels.out[:] = 0.0
         self._trusted = self._channels.calm >= self._parameters.hold_time
+
+
+def judge(channels: Channels, trusted: Bools) -> ArrayHealth:
+    """Judge sensors by their channels; of a sensor, its worst axis counts.
+
+    Dead: frozen, or for a second silent, or for a minute not trusted.
+    """
+    c = channels
+    reason = np.where(trusted, Reason.NONE, Reason.SETTLING).astype(np.int8)
+    reason[c.wandering > 0] = Reason.WANDERING
+    reason[c.rejected > BURST] = Reason.OUTLYING
+    reason[c.frozen > 0] = Reason.FROZEN
+    reason[c.silent > 0] = Reason.SILENT
+    worst = reason.max(axis=0)
+    dead = (c.frozen > 0) | (c.silent > SILENT_AFTER) | (c.out > DEAD_AFTER)
+    state = np.where(dead.any(axis=0), SensorState.DEAD, worst > Reason.NONE).astype(np.int8)
+    return ArrayHealth(state, worst, c.rejected.max(axis=0), c.bias.T.copy())
 
 
 def _jury(trusted: Bools, changing: Bools, valid: Bools) -> Bools:

@@ -87,3 +87,34 @@ def rate_matrix(rate_b: Floats) -> Floats:
     """
     x, y, z = rate_b.tolist()
     return np.array([[0.0, -x, -y, -z], [x, 0.0, z, -y], [y, -z, 0.0, x], [z, y, -x, 0.0]])
+
+
+def quaternion_from_matrix(R_ab: Floats) -> Floats:  # noqa: N803 a matrix is a capital
+    """Unit quaternions, shape (..., 4), w not negative, of rotation matrices, shape (..., 3, 3).
+
+    The eigenvector of the greatest eigenvalue of a symmetric matrix, which is as exact near half a
+    turn as elsewhere: Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation
+    Matrix", Journal of Guidance, Control, and Dynamics 23, 2000.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(R_ab, (-2, -1), (0, 1))
+    rows = [
+        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+    ]
+    vectors = np.linalg.eigh(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))[1]
+    q_ab: Floats = vectors[..., -1]
+    return np.where(q_ab[..., :1] < 0.0, -q_ab, q_ab)
+
+
+def nearest_rotation(matrices: Floats) -> Floats:
+    """Rotation matrices nearest to matrices, shape (..., 3, 3), by the sum of squared differences.
+
+    Markley, "Attitude Determination using Vector Observations and the Singular Value
+    Decomposition", Journal of the Astronautical Sciences 36, 1988.
+    """
+    u, _, v = np.linalg.svd(matrices)
+    u[..., -1] *= np.linalg.det(u @ v)[..., None]
+    rotations: Floats = u @ v
+    return rotations
