@@ -88,7 +88,7 @@ class Pipeline:
         self._filter: Eskf | PaperFilter
         self._aiding: Aiding | None = None
         if p.attitude.filter == "eskf":
-            self._filter, self._aiding = Eskf(p.attitude, p.heading), Aiding()
+            self._filter, self._aiding = Eskf(p.attitude, p.heading), Aiding(p.attitude)
         else:
             self._filter = PaperFilter(p.attitude)
         self._heading = p.heading

@@ -9,6 +9,7 @@ from filters import (
     DOWN,
     DT,
     GATE,
+    UNKNOWN,
     aligned_filter,
     assert_sound,
     fused,
@@ -22,7 +23,7 @@ from hypothesis import strategies as st
 from risaf_link.core.aiding import Aiding, SpeedTracker
 from risaf_link.core.earth import GRAVITY
 from risaf_link.core.eskf import Eskf, Gravity
-from risaf_link.core.rotation import quaternion_from_euler, wrap
+from risaf_link.core.rotation import matrix_from_quaternion, quaternion_from_euler, wrap
 
 # Gravity
 
@@ -253,3 +254,35 @@ def test_nothing_that_is_fed_makes_the_state_unsound(data):
                     aiding.take(estimator, rate, data.draw(TRIPLES), 0.01)
         run(estimator, 0.05)
         assert_sound(estimator)
+
+
+# Level
+
+
+def test_without_accelerometers_a_vehicle_is_level_on_the_average():
+    """Headings that are a little wrong say of the tilt what is not so, and a circle repeats it."""
+    generator = np.random.default_rng(8)
+    estimator, aiding = aligned_filter(), Aiding(DEFAULTS)
+    yaw, worst = 0.0, 0.0
+    for step in range(round(200.0 / DT)):
+        rate = np.array([0.0, 0.0, 0.1]) + 1e-3 * generator.normal(size=3) + [5e-4, -8e-4, 0.0]
+        yaw += 0.1 * DT
+        estimator.predict(fused(rate), DT)
+        aiding.take(estimator, fused(rate), UNKNOWN, DT)
+        if step % 20 == 0:
+            heading = yaw + 0.005 + 0.01 * generator.normal()
+            estimator.correct_heading(wrap(heading), 0.01**2, 0.0, GATE)
+        worst = max(worst, tilt_error(estimator, quaternion_from_euler(0.0, 0.0, 0.0)))
+    assert worst < 2.0
+    assert estimator.state(0).roll_std < DEFAULTS.initial_tilt_std
+
+
+def test_accelerometers_that_fall_silent_for_seconds_do_not_make_a_tilted_vehicle_level():
+    estimator, aiding = Eskf(DEFAULTS), Aiding(DEFAULTS)
+    tilted = quaternion_from_euler(0.3, 0.0, 0.0)
+    force_b = -DOWN @ matrix_from_quaternion(tilted)
+    for silent in (False, True):
+        for _ in range(round(9.0 / DT)):
+            estimator.predict(fused(np.zeros(3)), DT)
+            aiding.take(estimator, fused(np.zeros(3)), UNKNOWN if silent else force_b, DT)
+    assert tilt_error(estimator, tilted) < 0.5

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
 from risaf_link.core.eskf import (
     ACCELEROMETER,
@@ -37,10 +38,13 @@ BLOCK = 0.5  # s, of rest
 STILL, STILL_ALONE, STILL_ON_ROAD = 1.0, 3.0, 6.0  # s: GPS confirms, was never there, is gone
 STILL_BY_GRAVITY, CLAIMED_TURN = 10.0, 0.5  # s and rad, by which gravity refutes a rate
 LEVEL_PART = 0.6  # of that rate; a force that leans in a curve lends it less
+LEVEL_TIME, TILTED_TIME = 2.0, 15.0  # s, from level to level; s for which a road is as it is
+UNFELT = 10.0  # s without specific force after which there is no accelerometer
 QUIET = np.array([0.05] * 3 + [0.5] * 3)  # rad/s, m/s^2, standard deviation within a block
 LOOSE = np.array([0.01] * 3 + [0.2] * 3)  # rad/s, m/s^2, between blocks, with GPS
 STRICT = np.array([3e-4] * 3 + [0.01] * 3)  # without
 REST_RATE, UNCONFIRMED_RATE = 1e-4, 1e-3  # rad/s, of a vehicle at rest: wind, people
+USUAL = AttitudeParameters()
 
 
 class SpeedTracker:
@@ -314,9 +318,22 @@ class RestFinder:
 
 
 class Aiding:
-    """Feeds a filter with what the array and the speed tell of gravity and rest."""
+    """Feeds a filter with what the array and the speed tell of gravity and rest.
 
-    def __init__(self) -> None:
+    Without accelerometers nothing but headings would hold the tilt, and they hold it by what is
+    left of their errors. Then it is held by what is known beforehand: a vehicle is level on the
+    average, within `initial_tilt_std`, and stays as tilted as it is for about `TILTED_TIME`.
+
+    Parameters
+    ----------
+    parameters : AttitudeParameters
+    """
+
+    def __init__(self, parameters: AttitudeParameters = USUAL) -> None:
+        self._level_variance = (GRAVITY * parameters.initial_tilt_std) ** 2
+        self._level_variance *= 2.0 * TILTED_TIME / LEVEL_TIME
+        self._unfelt = 0.0  # s, since there was a specific force, or level was taken for granted
+        self._feels = False  # whether there was one of late
         self.speed = SpeedTracker()
         self._gravity = GravityFinder()
         self._rest = RestFinder()
@@ -347,6 +364,20 @@ class Aiding:
         if rest is not None:
             corrections += attitude.correct_zero_rate(rest.rate_b, rest.variance, rest.confirmed)
         gravity = self._gravity.take(attitude, force_b, dt, self.speed)
+        if gravity is None:
+            gravity = self._usual(attitude, force_b, dt)
         if gravity is not None:
             corrections += attitude.correct_gravity(gravity)
         return corrections
+
+    def _usual(self, attitude: Eskf, force_b: Floats, dt: float) -> Gravity | None:
+        """Gravity of a vehicle that is level, now and then, where none is felt."""
+        if np.isfinite(force_b).all():
+            self._unfelt, self._feels = 0.0, True
+            return None
+        self._unfelt += dt
+        if self._unfelt < (UNFELT if self._feels else LEVEL_TIME):
+            return None
+        self._unfelt, self._feels = 0.0, False
+        variance = self._level_variance
+        return Gravity(attitude.matrix @ (0.0, 0.0, GRAVITY), variance, variance)

@@ -428,6 +428,7 @@ class Eskf:
         self._wrong = self._wrong * kept
         covariance[HEADING] *= kept[:, np.newaxis]
         covariance[:, HEADING] *= kept
+        covariance[LATE, OFFSET] = covariance[OFFSET, LATE]  # rounded in another order
         covariance[HEADING_AXES, HEADING_AXES] += self._wrong_variance * (1.0 - kept * kept)
         covariance[BIAS_AXES, BIAS_AXES] += walk
         self._bound()
