@@ -160,6 +160,17 @@ def test_a_mix_of_faults_on_two_fifths_drifts_little_more_than_the_same_array_wi
     assert np.mean(faulty) < 3.0 * np.mean(sound)  # 0.1 degrees; the plain mean: 400
 
 
+@pytest.mark.parametrize(("share", "rate"), [(0.2, 25.0), (0.35, 100.0)])
+def test_spikes_on_every_sensor_are_no_reason_to_distrust_any(share, rate):
+    drive = Drive(40, 40.0, rate=rate)
+    sound = drift(drive, 10.0, 40.0)
+    hit = drive.generator.random(drive.readings.shape) < share
+    drive.readings += hit * drive.normal(20.0 * DEGREE, drive.readings.shape)
+    _, fusion = drive.fused()
+    assert (fusion.health().state == SensorState.HEALTHY).sum() >= 36
+    assert drift(drive, 10.0, 40.0) < 2.0 * sound + math.radians(0.05)
+
+
 def test_bursts_on_a_third_do_not_become_drift():
     clean = drift(Drive(60, 60.0), 20.0, 60.0)
     drive = Drive(60, 60.0)

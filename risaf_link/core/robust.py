@@ -23,9 +23,10 @@ A channel is on the jury if it is valid and trusted; r_i is its reading less its
    its bias has walked against the others': its share of the common mode is not lost.
 3. Watch. z_i, the residuals inside low-passed, shows what no single reading does: a burst's tail, a
    step, a drift, a scale. Alarms are |z_i - median z| beyond gate times the scaled median absolute
-   deviation of all z; more than `BURST` of the readings of a second rejected; a reading that does
-   not change although it should; silence. The median and deviation are those of all channels that
-   change, trusted or not: however many are out, the bar does not close in on the rest.
+   deviation of all z; of the readings of a second, `BURST` more rejected than of the trusted on the
+   average; a reading that does not change although it should; silence. The median and deviation are
+   those of all channels that change, trusted or not: however many are out, the bar does not close
+   in on the rest.
 4. Trust. A channel is trusted once it has been `hold_time` without an alarm. One that has not been
    trusted for `RELEARN` is taken to have changed for good, and learns its bias anew, as a new one
    does: from all of its readings, without a say in the rate.
@@ -68,7 +69,7 @@ Bools = NDArray[np.bool_]
 LIMIT = 1e6  # rad/s; beyond, a reading is not one
 LONGEST = 0.1  # s; an epoch counts for no more, so after a gap nothing is judged at once
 WATCH_TIME = 3.0  # s, low pass of z: far below T, long enough to see a tenth of the noise
-BURST_TIME, BURST = 1.0, 0.2  # s and share rejected: 1 % of spikes is no burst, 0.2 s of shock is
+BURST_TIME, BURST = 1.0, 0.2  # s and share rejected: 0.2 s of shock are a burst
 SWELL = 3.0  # times the spread of late: what the spread of an epoch may be, if noise has grown
 NOISE_TIME = 2.0  # s, of averaging the noise: vibration comes and goes in seconds
 SPREAD_TIME = 30.0  # s, of averaging the spread of z: ten times its low pass
@@ -106,6 +107,7 @@ class Channels:
     calm: Floats  # since the last alarm
     out: Floats  # since it was last trusted
     wandering: Floats  # 1: z is an alarm
+    outlying: Floats  # 1: so is the share rejected
 
     @classmethod
     def new(cls, n: int) -> "Channels":
@@ -305,7 +307,9 @@ class Robust:
     def _trust(self, dt: float) -> NDArray[np.int64]:
         """Judge every channel anew; how many of each axis have come or gone."""
         c = self._channels
-        alarm = c.rejected > BURST
+        usual = (c.rejected * self._trusted).sum(axis=1) / np.maximum(self._trusted.sum(axis=1), 1)
+        np.greater(c.rejected, usual[:, None] + BURST, out=c.outlying)
+        alarm = c.outlying > 0.0
         alarm |= c.wandering > 0.0
         alarm |= c.frozen > 0.0
         alarm |= c.silent > SILENT_AFTER
@@ -379,7 +383,7 @@ def judge(channels: Channels, trusted: Bools) -> ArrayHealth:
     c = channels
     reason = np.where(trusted, Reason.NONE, Reason.SETTLING).astype(np.int8)
     reason[c.wandering > 0] = Reason.WANDERING
-    reason[c.rejected > BURST] = Reason.OUTLYING
+    reason[c.outlying > 0] = Reason.OUTLYING
     reason[c.frozen > 0] = Reason.FROZEN
     reason[c.silent > 0] = Reason.SILENT
     worst = reason.max(axis=0)

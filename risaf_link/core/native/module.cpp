@@ -66,6 +66,7 @@ nb::dict all_channels(const risaf::Robust& robust) {
   all["silent"] = channels(robust, &Axis::silent);
   all["calm"] = channels(robust, &Axis::calm);
   all["out"] = channels(robust, &Axis::out);
+  all["outlying"] = channels(robust, &Axis::outlying);
   all["wandering"] = channels(robust, &Axis::wandering);
   return all;
 }

@@ -29,7 +29,7 @@ class Robust {
   struct Axis {
     std::vector<double> reading, count, residual, bias, age, slow, rejected, unchanged, moved;
     std::vector<double> silent, calm, out;
-    std::vector<std::uint8_t> frozen, wandering, trusted;
+    std::vector<std::uint8_t> frozen, wandering, outlying, trusted;
     double spread = 0.0, slow_spread = 0.0, centre = 0.0, turning = 0.0, jitter = 0.0;
     double calm_walk = 0.0, noise = NaN;
     // Of this epoch.
@@ -47,7 +47,7 @@ class Robust {
       }
       calm.resize(n, first ? p.hold_time : 0.0);
       out.resize(n, first ? 0.0 : p.relearn);
-      for (auto* flags : {&frozen, &wandering, &trusted, &valid, &changing, &jury, &inside, &active}) {
+      for (auto* flags : {&frozen, &wandering, &outlying, &trusted, &valid, &changing, &jury, &inside, &active}) {
         flags->resize(n, 0);
       }
       corrected.resize(n);
@@ -266,9 +266,16 @@ class Robust {
 
   // How many channels have come or gone.
   std::size_t trust(Axis& a, double dt) {
-    std::size_t moved = 0;
+    std::size_t moved = 0, trusting = 0;
+    double usual = 0.0;
     for (std::size_t i = 0; i < n_; ++i) {
-      const bool alarm = a.rejected[i] > p.burst || a.wandering[i] || a.frozen[i] ||
+      usual += a.trusted[i] ? a.rejected[i] : 0.0;
+      trusting += a.trusted[i];
+    }
+    usual /= static_cast<double>(std::max<std::size_t>(trusting, 1));
+    for (std::size_t i = 0; i < n_; ++i) {
+      a.outlying[i] = a.rejected[i] > usual + p.burst;
+      const bool alarm = a.outlying[i] || a.wandering[i] || a.frozen[i] ||
                          a.silent[i] > p.silent_after;
       a.calm[i] = alarm ? 0.0 : a.calm[i] + dt;
       const bool trusted = a.calm[i] >= p.hold_time;
