@@ -13,7 +13,7 @@ LAYERS = [
     {"pipeline"},
     {"links", "publish", "sim"},
     {"config"},
-    {"service", "replay", "survey", "calibrate"},
+    {"service", "replay", "survey", "calibrate", "experiments"},
     {"words"},
     {"cli"},
 ]
