@@ -310,6 +310,53 @@ def calibrate(
     click.echo(json.dumps(found) if options["as_json"] else calibration_text(log, found))
 
 
+@main.command()
+@click.argument("name")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    metavar="DIR",
+    help="Where figures and numbers go; one that was interrupted goes on from there.",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="At most so many.  [default: 20, fewer in some]",
+)
+@click.option("--quick", is_flag=True, help="Few seeds, few sensors, short drives.")
+@click.option(
+    "--method",
+    "methods",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FILE.py",
+    help="A method of your own to compare. Repeatable.",
+)
+@click.option(
+    "--workers", type=click.IntRange(min=1), metavar="N", help="Processes.  [default: all cores]"
+)
+@click.option("--cluster", metavar="ADDRESS", help="A Dask scheduler (needs the extra `cluster`).")
+def experiment(name: str, out: Path, **options: Any) -> None:
+    """Repeat one of the paper's figures or tables, with every method on the same input.
+
+    NAME is one of `sensors` (fig. 1, 2), `circle` (fig. 5), `montecarlo` (fig. 6), `drive1`
+    (fig. 9, 10, 14), `drive2` (fig. 12, 13, 15), `outages` (fig. 16), `faults` (one kind at a
+    time), `sensitivity` (section III.B), `cost` (table I), and `all`, which adds a page, index.md.
+    Each leaves a PNG, JSON and CSV. Needs the extra `plot`.
+
+    \b
+    risaf-link experiment drive1 --out results
+    risaf-link experiment all --quick --out results
+    risaf-link experiment montecarlo --method mine.py --out results
+    """
+    from risaf_link.experiments.run import experiment as perform
+
+    for section in perform(name, out, **options):
+        click.echo(out / f"{section.name}.png")
+
+
 @main.command("check-config")
 @click.argument("file", type=click.Path(path_type=Path))
 def check_config(file: Path) -> None:

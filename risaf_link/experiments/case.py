@@ -202,11 +202,13 @@ class _Trace:
         """Integrate about the body's down axis; the road is taken for level."""
         rates = instant.epoch.rates_b[:, 2]
         self._integral += np.nan_to_num(rates) * instant.epoch.dt
-        self._mean_error += 0.01 * (float(np.nanmean(rates)) - instant.rate_b[2] - self._mean_error)
+        self._mean_error += 0.01 * (
+            float(np.nanmean(rates)) - float(instant.rate_b[2]) - self._mean_error
+        )
         for gps in instant.fixes:
             if gps.motion.heading:
                 self._columns["gps_time_s"].append(round(instant.elapsed, 3))
-                self._columns["gps"].append(round(gps.motion.heading.heading, 6))
+                self._columns["gps"].append(round(float(gps.motion.heading.heading), 6))
                 self._columns["withheld"].append(withheld)
 
     def keep(self, instant: Instant) -> None:

@@ -26,11 +26,11 @@ class Particles:
     0, and never less than `exp(-width^2)`, so an outlier cannot kill the right ones (the kernel of
     Liu, Pokharel and Principe, "Correntropy: Properties and Applications in Non-Gaussian Signal
     Processing", IEEE Transactions on Signal Processing 55, 2007). Resampling is systematic, when
-    the effective number is below half (Arulampalam, Maskell, Gordon and Clapp, "A Tutorial on Particle
-    Filters for Online Nonlinear/Non-Gaussian Bayesian Tracking", IEEE Transactions on Signal
-    Processing 50, 2002); since biases hardly move, particles that were doubled are spread by the
-    shrinking kernel of Liu and West, "Combined Parameter and State Estimation in Simulation-Based
-    Filtering", 2001, which keeps mean and covariance.
+    the effective number is below half (Arulampalam, Maskell, Gordon and Clapp, "A Tutorial on
+    Particle Filters for Online Nonlinear/Non-Gaussian Bayesian Tracking", IEEE Transactions on
+    Signal Processing 50, 2002); since biases hardly move, particles that were doubled are spread by
+    the shrinking kernel of Liu and West, "Combined Parameter and State Estimation in
+    Simulation-Based Filtering", 2001, which keeps mean and covariance.
 
     Parameters
     ----------
