@@ -64,9 +64,9 @@ def sensors(setting: Setting) -> Section:
         f"the first, as after a calibration: beyond 3 and 4 standard deviations are {tails[0]:.2e} "
         f"and {tails[1]:.2e} of all errors (of Gaussian ones 2.7e-03 and 6.3e-05); of each "
         f"sensor's noise about its own mean, in its own standard deviations, {_beyond(own)[0]:.2e} "
-        f"and {_beyond(own)[1]:.2e}. {static.truth} A run is {duration:.0f} s; what does not show in "
-        "that time is left empty: no bias instability or rate random walk can be read off a short "
-        "record.",
+        f"and {_beyond(own)[1]:.2e}. {static.truth} A run is {duration:.0f} s; what does not show "
+        "in that time is left empty: no bias instability or rate random walk can be read off a "
+        "short record.",
         "a sensor's heading drifts differently in two runs; the array's errors have heavier tails "
         "than Gaussian ones. About 150 sensors; no coefficients are given.",
         [
