@@ -9,7 +9,8 @@ from risaf_link.core import kernel
 from risaf_link.core.aiding import Aiding
 from risaf_link.core.attitude import AttitudeParameters, PaperFilter
 from risaf_link.core.eskf import Eskf
-from risaf_link.core.fusion import Epoch, Fusion, FusionParameters, Mean
+from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters, Mean
+from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, wrap
 from risaf_link.experiments.method import Aided, ArrayModel, Estimate, Gps, one_rate
 from risaf_link.experiments.so3 import exp
@@ -23,27 +24,32 @@ class Ours(Aided):
 
     def __init__(self, _: ArrayModel) -> None:
         parameters, fusion = AttitudeParameters(), FusionParameters()
-        super().__init__(Eskf(parameters))
+        super().__init__(Eskf(parameters, HeadingParameters()))
         self.fusion = kernel.Robust(fusion)
         self._force_fusion = kernel.Robust(structs.replace(fusion, resolution=FORCE_RESOLUTION))
         self._aiding = Aiding(parameters)
 
     def step(self, epoch: Epoch) -> None:
         """Carry the estimate on to an epoch."""
-        fused = self.fusion.fuse(epoch)
-        self.advance(fused, epoch.dt)
         force_b = NO_FORCE
         if len(epoch.forces_b):
             forces = epoch.time_us, epoch.dt, epoch.forces_b
             force_b = self._force_fusion.fuse_readings(*forces).rate_b
-        self._aiding.take(self.attitude, fused, force_b, epoch.dt)
+        self.advance(self.fusion.fuse(epoch), epoch.dt, force_b)
+
+    def aid(self, fused: FusedRate, dt: float, force_b: Floats) -> None:
+        """Correct the filter by gravity and rest."""
+        self._aiding.take(self.attitude, fused, force_b, dt)
 
     def correct(self, gps: Gps) -> None:
-        """Use a fix: its latitude, speed and heading."""
-        motion = gps.motion
-        self.attitude.set_latitude(gps.latitude)
-        self._aiding.speed.hear(motion.speed, motion.speed_std**2, gps.delay)
+        """Use a fix: its heading, latitude and speed."""
+        gear, motion = self.guard.gear.sign, gps.motion
         super().correct(gps)
+        self.attitude.set_latitude(gps.latitude)
+        if self.guard.gear.sign != gear:
+            self._aiding.speed.turn_round()
+        if motion.along and motion.is_news and not motion.contradicted:
+            self._aiding.speed.hear(self.guard.ahead(motion), motion.speed_std**2, gps.delay)
 
 
 class Fused(Aided):

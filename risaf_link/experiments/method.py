@@ -24,10 +24,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from risaf_link.core.attitude import AttitudeState, Innovation
+from risaf_link.core.attitude import Innovation
+from risaf_link.core.eskf import Eskf
 from risaf_link.core.fusion import Epoch, FusedRate
-from risaf_link.core.heading import HeadingMonitor, HeadingParameters, Motion
+from risaf_link.core.guard import Estimator, HeadingGuard
+from risaf_link.core.heading import HeadingParameters, Motion
 from risaf_link.core.rotation import Floats
+from risaf_link.pipeline import NO_FORCE
 
 
 class ArrayModel(NamedTuple):
@@ -73,57 +76,6 @@ class Method(Protocol):
         ...
 
 
-class HeadingFilter(Protocol):
-    """A filter of attitude that takes one fused rate an epoch, such as `PaperFilter` or `Eskf`."""
-
-    def predict(self, fused: FusedRate, dt: float) -> None:
-        """Carry the state on."""
-        ...
-
-    def correct_heading(
-        self, heading: float, variance: float, age: float, gate: float
-    ) -> Innovation:
-        """Fuse a heading."""
-        ...
-
-    def reset_heading(self, heading: float, variance: float, age: float, gate: float) -> Innovation:
-        """Set yaw by a heading."""
-        ...
-
-    def state(self, time_us: int) -> AttitudeState:
-        """Read the estimate."""
-        ...
-
-
-class HeadingGate:
-    """Feeds a filter with headings as the service does: gated, and believed when it must be wrong.
-
-    Parameters
-    ----------
-    parameters : HeadingParameters
-    """
-
-    def __init__(self, parameters: HeadingParameters) -> None:
-        self._gate = parameters.gate
-        self._monitor = HeadingMonitor(parameters)
-
-    def advance(self, dt: float) -> None:
-        """Let time pass, s."""
-        self._monitor.advance(dt)
-
-    def take(self, attitude: "Corrected", gps: Gps) -> None:
-        """Correct an attitude by a fix, if it holds a heading."""
-        self._monitor.note_motion(gps.motion)
-        heading = gps.motion.heading
-        if heading is None:
-            return
-        measured = heading.heading, heading.variance, gps.delay + heading.age
-        innovation = attitude.correct_heading(*measured, self._gate)
-        if self._monitor.distrusts_filter and not innovation.fused:
-            innovation = attitude.reset_heading(*measured, self._gate)
-        self._monitor.note_innovation(heading, innovation)
-
-
 class Corrected(Protocol):
     """What headings correct."""
 
@@ -138,31 +90,71 @@ class Corrected(Protocol):
         ...
 
 
-class Aided:
-    """A filter with its headings: all of a method but the fusion, and `step`.
+class HeadingGate:
+    """Feeds a rival with headings: gated, and believed when all were rejected for long.
 
     Parameters
     ----------
-    attitude : HeadingFilter
-    heading : HeadingParameters
+    parameters : HeadingParameters
     """
 
-    def __init__(self, attitude: HeadingFilter, heading: HeadingParameters | None = None) -> None:
-        self.attitude = attitude
-        self._headings = HeadingGate(heading or HeadingParameters())
+    def __init__(self, parameters: HeadingParameters) -> None:
+        self._parameters = parameters
+        self._elapsed = 0.0  # s
+        self._last = -math.inf  # s, when the last heading came
+        self._rejecting_since = math.inf  # s
 
-    def advance(self, fused: FusedRate, dt: float) -> None:
-        """Carry the filter on by a fused rate, over `dt` seconds."""
+    def advance(self, dt: float) -> None:
+        """Let time pass, s."""
+        self._elapsed += dt
+
+    def take(self, attitude: Corrected, gps: Gps) -> None:
+        """Correct an attitude by a fix, if it holds a heading that its positions do not deny."""
+        p, heading = self._parameters, gps.motion.heading
+        if heading is None or gps.motion.contradicted:
+            return
+        measured = heading.heading, heading.variance, gps.delay + heading.age
+        fused = attitude.correct_heading(*measured, p.gate).fused
+        if fused or self._elapsed - self._last > p.timeout:
+            self._rejecting_since = math.inf
+        if not fused:
+            self._rejecting_since = min(self._rejecting_since, self._elapsed)
+        self._last = self._elapsed
+        if self._elapsed - self._rejecting_since > p.reset_after:
+            attitude.reset_heading(*measured, p.gate)
+            self._rejecting_since = math.inf
+
+
+class Aided:
+    """A filter of the service with its headings: all of a method but the fusion, and `step`.
+
+    Parameters
+    ----------
+    attitude : Eskf or PaperFilter
+    """
+
+    def __init__(self, attitude: Estimator) -> None:
+        self.attitude = attitude
+        self.guard = HeadingGuard(HeadingParameters(), filter_knows=isinstance(attitude, Eskf))
+        self._state = attitude.state(0)
+
+    def advance(self, fused: FusedRate, dt: float, force_b: Floats = NO_FORCE) -> None:
+        """Carry the filter on by a fused rate, over `dt` seconds; specific force in m/s^2."""
         self.attitude.predict(fused, dt)
-        self._headings.advance(dt)
+        self.aid(fused, dt, force_b)
+        state = self.attitude.state(fused.time_us)
+        self._state = self.guard.advance(state, force_b, dt)
+
+    def aid(self, fused: FusedRate, dt: float, force_b: Floats) -> None:
+        """Correct the filter by what else is known; by nothing, unless a method says otherwise."""
 
     def correct(self, gps: Gps) -> None:
         """Use a fix."""
-        self._headings.take(self.attitude, gps)
+        self.guard.take(self.attitude, gps.motion)
 
     def estimate(self) -> Estimate:
         """Say the heading as of the last epoch."""
-        state = self.attitude.state(0)
+        state = self._state
         yaw = state.euler[2] if state.aligned else math.nan
         return Estimate(yaw, state.yaw_std, float(state.bias_b[2]))
 
