@@ -20,7 +20,7 @@ from risaf_link.experiments import drives
 from risaf_link.experiments.allan import allan_deviation, coefficients
 from risaf_link.experiments.case import Case
 from risaf_link.experiments.cost import Timing, exponent
-from risaf_link.experiments.report import rmses, spread
+from risaf_link.experiments.report import Section, Setting, page, rmses, spread
 from risaf_link.experiments.run import EXPERIMENTS
 from risaf_link.experiments.sweep import Sweep
 
@@ -127,6 +127,17 @@ def test_a_run_without_a_heading_is_the_worst():
     assert spread([1.0, math.nan, 2.0, 3.0, 4.0])[0] == 3.0
     result = {"methods": {"a": {"outages": [{"truth": None}]}}}
     assert math.isnan(rmses([result], "a")[0])
+
+
+def test_the_page_shows_figures_numbers_and_what_the_paper_says(tmp_path):
+    section = Section(
+        "drive1", "Drive I", "We drove.", "2.6 times.", ["method", "deg"], [("a", math.nan)], {}
+    )
+    text = page(Setting(tmp_path, Sweep(tmp_path)), [section]).read_text()
+    assert "![Drive I](drive1.png)" in text
+    assert "*The paper:* 2.6 times." in text
+    assert "| a |  |" in text
+    assert "[drive1.csv](drive1.csv)" in text
 
 
 @pytest.fixture
