@@ -73,6 +73,25 @@ def _configured(command: Command) -> Command:
     return file(setting(command))
 
 
+def _selected(command: Command) -> Command:
+    """Add the options that choose a part of a log."""
+    end = click.option(
+        "--end",
+        type=click.FloatRange(min=0),
+        default=float("inf"),
+        metavar="S",
+        help="Stop after S seconds of the log.",
+    )
+    start = click.option(
+        "--start",
+        type=click.FloatRange(min=0),
+        default=0.0,
+        metavar="S",
+        help="Skip the first S seconds of the log.",
+    )
+    return start(end(command))
+
+
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="risaf-link")
 def main() -> None:
@@ -118,20 +137,7 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
     metavar="N",
     help="Times real time.  [default: as fast as it goes]",
 )
-@click.option(
-    "--start",
-    type=click.FloatRange(min=0),
-    default=0.0,
-    metavar="S",
-    help="Skip the first S seconds of the log.",
-)
-@click.option(
-    "--end",
-    type=click.FloatRange(min=0),
-    default=float("inf"),
-    metavar="S",
-    help="Stop after S seconds of the log.",
-)
+@_selected
 @click.option(
     "--outage",
     "outages",
@@ -270,20 +276,7 @@ def inspect(log: Path, config_path: Path | None, settings: tuple[str, ...]) -> N
     metavar="FILE",
     help="The calibration, YAML, for array.calibration.",
 )
-@click.option(
-    "--start",
-    type=click.FloatRange(min=0),
-    default=0.0,
-    metavar="S",
-    help="Skip the first S seconds of the log.",
-)
-@click.option(
-    "--end",
-    type=click.FloatRange(min=0),
-    default=float("inf"),
-    metavar="S",
-    help="Stop after S seconds of the log.",
-)
+@_selected
 @click.option("--json", "as_json", is_flag=True, help="Print what was found as one JSON object.")
 def calibrate(
     log: Path, config_path: Path | None, settings: tuple[str, ...], **options: Any
