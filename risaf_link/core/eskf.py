@@ -29,10 +29,12 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from risaf_link.core import quaternion
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.heading import HeadingParameters
+from risaf_link.core.quaternion import Quaternion, Vector
 from risaf_link.core.rotation import Floats, wrap
 
 ATTITUDE = slice(0, 3)  # error: rotation vector, rad, NED
@@ -60,9 +62,6 @@ RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
 STEEP = 0.99  # sine of the pitch beyond which a heading says nothing of yaw: 82 deg
 
 USUAL_HEADING = HeadingParameters()
-
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 
 class Outcome(IntEnum):
@@ -162,12 +161,12 @@ class Eskf:
     @property
     def matrix(self) -> Floats:
         """`R_nb` as of the last predict."""
-        return _matrix(self._attitude)
+        return quaternion.matrix(self._attitude)
 
     @property
     def matrix_ib(self) -> Floats:
         """`R_ib` as of the last predict: i is n at the start, carried on by the rate alone."""
-        return _matrix(self._by_rate)
+        return quaternion.matrix(self._by_rate)
 
     @property
     def drive_ib(self) -> Floats:
@@ -177,7 +176,7 @@ class Eskf:
     @property
     def matrix_ni(self) -> Floats:
         """`R_ni`: all corrections, and the earth's rotation, until now."""
-        return _matrix(self._correction)
+        return quaternion.matrix(self._correction)
 
     @property
     def rate(self) -> Floats:
@@ -207,7 +206,7 @@ class Eskf:
 
     @property
     def _attitude(self) -> Quaternion:
-        return _product(self._correction, self._by_rate)
+        return quaternion.product(self._correction, self._by_rate)
 
     @property
     def covariance(self) -> Floats:
@@ -238,8 +237,12 @@ class Eskf:
         self._rate = np.where(known, read - self._scale @ read, held)
         unseen = self._see(known, dt)
         before = self._by_rate
-        self._by_rate = _unit(_product(before, _exp(self._rotation(dt))))
-        self._drive_ib = drive(_matrix(_between(before, self._by_rate, 0.5)), self._rate)
+        self._by_rate = quaternion.unit(
+            quaternion.product(before, quaternion.exp(self._rotation(dt)))
+        )
+        self._drive_ib = drive(
+            quaternion.matrix(quaternion.between(before, self._by_rate, 0.5)), self._rate
+        )
         x, y, z = self._earth_rate()
         self._turn((-x * dt, -y * dt, -z * dt))
         self._elapsed += dt
@@ -294,7 +297,7 @@ class Eskf:
         if not _usable(heading, variance, age):
             return Correction(heading, variance, gate, False, "heading", Outcome.NOT_FINITE)
         age = self._true_age(age)
-        error = wrap(heading - float(self._wrong[0]) - _yaw(self._attitude_before(age)))
+        error = wrap(heading - float(self._wrong[0]) - quaternion.yaw(self._attitude_before(age)))
         spread = float(self._covariance[DOWN, DOWN]) + variance
         self._turn((0.0, 0.0, error))
         cosine, sine = math.cos(error), math.sin(error)
@@ -332,7 +335,7 @@ class Eskf:
         variances = [gravity.right * scale, gravity.forward * scale]
         if not self._levelled:
             return self._level(about_n, gravity, variances)
-        rows = _level_rows(_yaw(self._attitude), gravity, size)
+        rows = _level_rows(quaternion.yaw(self._attitude), gravity, size)
         errors = [float(row[0] * about_n[0] + row[1] * about_n[1]) for row in rows]
         corrections = self._fuse_all("gravity", rows, errors, variances, gate)
         patience = 0.0 if self.resting else self._parameters.gravity_distrust
@@ -373,14 +376,14 @@ class Eskf:
 
     def state(self, time_us: int) -> AttitudeState:
         """Read the estimate as of the last predict."""
-        q_nb = self.quaternion
-        matrix_nb = self.matrix
+        q_nb = self._attitude
+        matrix_nb = quaternion.matrix(q_nb)
         rows = np.array([*_tilt_rows(matrix_nb), _yaw_row(matrix_nb, self._rate, 0.0)[ATTITUDE]])
-        variance = ((rows @ self.covariance[ATTITUDE, ATTITUDE]) * rows).sum(axis=1)
+        variance = ((rows @ self._covariance[ATTITUDE, ATTITUDE]) * rows).sum(axis=1)
         roll, pitch, yaw = np.minimum(np.sqrt(variance), math.pi).tolist()
         return AttitudeState(
             time_us,
-            q_nb,
+            np.array(q_nb),
             self._rate.copy(),
             self._bias.copy(),
             roll,
@@ -480,7 +483,7 @@ class Eskf:
         for axis in (0, 1):
             self._covariance[axis, :] = self._covariance[:, axis] = 0.0
             self._covariance[axis, axis] = math.pi**2
-        turned = _matrix(_exp((*about_n, 0.0)))
+        turned = quaternion.matrix(quaternion.exp((*about_n, 0.0)))
         upright = replace(
             gravity, lever=turned @ gravity.lever, by_errors=turned @ gravity.by_errors
         )
@@ -502,7 +505,9 @@ class Eskf:
 
     def _turn(self, angle_n: Vector) -> None:
         """Turn the attitude, and with it its history, about axes of NED."""
-        self._correction = _unit(_product(_exp(angle_n), self._correction))
+        self._correction = quaternion.unit(
+            quaternion.product(quaternion.exp(angle_n), self._correction)
+        )
 
     def _fuse_all(
         self,
@@ -569,7 +574,7 @@ class Eskf:
         None while the vehicle points up or down: it says nothing of yaw.
         """
         age = self._true_age(age)
-        matrix_then = _matrix(self._attitude_before(age))
+        matrix_then = quaternion.matrix(self._attitude_before(age))
         yaw_then = math.atan2(matrix_then[1, 0], matrix_then[0, 0])
         error = wrap(heading - float(self._wrong[0]) - yaw_then)
         if abs(matrix_then[2, 0]) > STEEP:
@@ -586,7 +591,9 @@ class Eskf:
         since, until = age + RATE_SPAN, max(age - RATE_SPAN, 0.0)
         if not until < since < math.inf:  # so long ago that nothing is known
             return 0.0
-        turned = _yaw(self._attitude_before(until)) - _yaw(self._attitude_before(since))
+        turned = quaternion.yaw(self._attitude_before(until)) - quaternion.yaw(
+            self._attitude_before(since)
+        )
         return wrap(turned) / (since - until)
 
     def _attitude_before(self, age: float) -> Quaternion:
@@ -602,8 +609,8 @@ class Eskf:
         by_rate = earlier[1]
         if later and later[0] > earlier[0]:
             part = (time - earlier[0]) / (later[0] - earlier[0])
-            by_rate = _between(by_rate, later[1], part)
-        return _product(self._correction, by_rate)
+            by_rate = quaternion.between(by_rate, later[1], part)
+        return quaternion.product(self._correction, by_rate)
 
 
 def _usable(heading: float, variance: float, age: float) -> bool:
@@ -657,53 +664,3 @@ def _tilt_rows(matrix_nb: Floats) -> tuple[Floats, Floats]:
     level = max(north * north + east * east, 1e-12)
     cosine = math.sqrt(level)
     return np.array([north, east, 0.0]) / level, np.array([-east, north, 0.0]) / cosine
-
-
-def _product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Hamilton product p (x) q."""
-    a, b, c, d = p
-    w, x, y, z = q
-    return (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
-
-
-def _exp(angle: Vector) -> Quaternion:
-    """Quaternion of a rotation vector."""
-    x, y, z = angle
-    norm = math.sqrt(x * x + y * y + z * z)
-    part = math.sin(norm / 2.0) / norm if norm > 1e-9 else 0.5
-    return math.cos(norm / 2.0), part * x, part * y, part * z
-
-
-def _unit(q: Quaternion) -> Quaternion:
-    w, x, y, z = q
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    return w / norm, x / norm, y / norm, z / norm
-
-
-def _between(p: Quaternion, q: Quaternion, part: float) -> Quaternion:
-    """Attitude between two that are a sample apart; of a linear rotation, to the third order."""
-    a, b, c, d = p
-    w, x, y, z = q
-    return _unit((a + part * (w - a), b + part * (x - b), c + part * (y - c), d + part * (z - d)))
-
-
-def _yaw(q: Quaternion) -> float:
-    w, x, y, z = q
-    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
-
-
-def _matrix(q: Quaternion) -> Floats:
-    """`R_nb` of a unit quaternion."""
-    w, x, y, z = q
-    return np.array(
-        [
-            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-        ]
-    )
