@@ -14,10 +14,8 @@ import numpy as np
 from msgspec import Struct, field, structs
 
 from risaf_link.core import kernel
-from risaf_link.core.aiding import Aiding
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.attitude import AttitudeParameters, PaperFilter
-from risaf_link.core.eskf import Eskf
 from risaf_link.core.estimate import ArrayStatus, Estimate
 from risaf_link.core.fusion import Epoch, Fusion, FusionParameters, Mean, Median
 from risaf_link.core.guard import HeadingGuard
@@ -85,10 +83,11 @@ class Pipeline:
         self._force_fusion = kernel.Robust(structs.replace(p.fusion, resolution=FORCE_RESOLUTION))
         self._health = self._fusion.health()
         self._judged = 0.0  # s, when it was made
-        self._filter: Eskf | PaperFilter
-        self._aiding: Aiding | None = None
+        self._filter: kernel.Eskf | PaperFilter
+        self._aiding: kernel.Aiding | None = None
         if p.attitude.filter == "eskf":
-            self._filter, self._aiding = Eskf(p.attitude, p.heading), Aiding(p.attitude)
+            self._filter = kernel.Eskf(p.attitude, p.heading)
+            self._aiding = kernel.Aiding(p.attitude)
         else:
             self._filter = PaperFilter(p.attitude)
         self._heading = p.heading
@@ -128,7 +127,7 @@ class Pipeline:
         self._elapsed += epoch.dt
         self._filter.predict(fused, epoch.dt)
         force_b = self._force(epoch)
-        if isinstance(self._filter, Eskf) and self._aiding:
+        if self._aiding and not isinstance(self._filter, PaperFilter):
             self._aiding.take(self._filter, fused, force_b, epoch.dt)
         self._monitor.advance(epoch.dt)
         attitude = self._filter.state(epoch.time_us)
@@ -151,7 +150,7 @@ class Pipeline:
         innovation = self._guard.take(self._filter, motion)
         if innovation and motion.heading:
             self._monitor.note_innovation(motion.heading, innovation)
-        if isinstance(self._filter, Eskf) and self._aiding:
+        if self._aiding and not isinstance(self._filter, PaperFilter):
             self._filter.set_latitude(fix.latitude)
             if self._guard.gear.sign != gear:
                 self._aiding.speed.turn_round()

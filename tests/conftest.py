@@ -2,7 +2,11 @@
 
 import os
 
+import filters
+import pytest
 from hypothesis import settings
+
+from risaf_link.core import kernel
 
 settings.register_profile(
     "risaf",
@@ -10,3 +14,18 @@ settings.register_profile(
     derandomize="CI" in os.environ,  # nor is a change that did not touch what fails
 )
 settings.load_profile("risaf")
+
+
+@pytest.fixture(scope="module", params=filters.FORMS)
+def filter_form(request):
+    """Run the tests of a module on both forms of fusion and filter."""
+    if request.param == "kernel" and not kernel.BUILT:
+        pytest.skip("no kernel was built: that takes a C++ compiler")
+    with pytest.MonkeyPatch.context() as patch:
+        for numpy_form, form in zip(
+            filters.FORMS["numpy"], filters.FORMS[request.param], strict=True
+        ):
+            for module in (filters, request.module):
+                if hasattr(module, numpy_form.__name__):
+                    patch.setattr(module, numpy_form.__name__, form)
+        yield request.param

@@ -4,11 +4,18 @@ import math
 
 import numpy as np
 
+from risaf_link.core import aiding, eskf, kernel, robust
 from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
 from risaf_link.core.eskf import Eskf, Gravity
 from risaf_link.core.fusion import FusedRate, FusionParameters
 from risaf_link.core.rotation import matrix_from_quaternion
+
+FORMS = {
+    "numpy": (robust.Robust, eskf.Eskf, aiding.Aiding, aiding.SpeedTracker),
+    "kernel": (kernel.Robust, kernel.Eskf, kernel.Aiding, kernel.SpeedTracker),
+}
+"""What tests of the filter are run on, one form after the other: fixture `filter_form`."""
 
 DEFAULTS = AttitudeParameters()
 SENSORS = FusionParameters()

@@ -25,6 +25,8 @@ from risaf_link.core.earth import GRAVITY
 from risaf_link.core.eskf import Eskf, Gravity
 from risaf_link.core.rotation import matrix_from_quaternion, quaternion_from_euler, wrap
 
+pytestmark = pytest.mark.usefixtures("filter_form")
+
 # Gravity
 
 

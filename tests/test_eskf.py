@@ -38,6 +38,8 @@ from risaf_link.core.rotation import (
     wrap,
 )
 
+pytestmark = pytest.mark.usefixtures("filter_form")
+
 DATA = Path(os.environ.get("RISAF_DATA", Path(__file__).parents[1] / "../shared/data"))
 RUNS = sorted((DATA / "ekf2_runs").glob("*.npz"))
 ZURICH = math.radians(47.4)
@@ -80,7 +82,7 @@ def test_coning_of_a_vibrating_axis_is_carried_to_the_third_order():
     turned = np.einsum("nji,njk->nik", matrices[:-1], matrices[1:])
     small = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=1)
     means = small.reshape(steps, 10, 3).sum(axis=1) / dt
-    estimator._correction = tuple(cone[0])
+    estimator.set_attitude(cone[0])
     for mean in means:
         estimator.predict(fused(mean), dt)
     drift = math.degrees(rate * (1 - math.cos(half)) * times[-1])
@@ -187,7 +189,7 @@ def test_the_first_heading_sets_yaw_and_is_counted():
 def test_unknown_yaw_does_not_leak_into_the_tilt():
     truth = quaternion_from_euler(math.radians(40.0), math.radians(-50.0), 0.0)
     estimator = level_filter()
-    estimator._correction = tuple(truth)
+    estimator.set_attitude(truth)
     run(estimator, 1.0)
     stds = [math.sqrt(estimator.covariance[axis, axis]) for axis in (0, 1)]
     for yaw in (100.0, -170.0, 10.0):
@@ -286,7 +288,7 @@ def test_every_reset_is_counted_and_its_value_is_the_change():
 )
 def test_a_heading_s_spread_is_between_its_variance_and_100_in_every_attitude(roll, pitch, yaw):
     estimator = aligned_filter(std=0.1)
-    estimator._correction = tuple(quaternion_from_euler(roll, pitch, yaw))
+    estimator.set_attitude(quaternion_from_euler(roll, pitch, yaw))
     variance = 0.1**2
     correction = estimator.correct_heading(yaw, variance, 0.0, GATE)
     assert variance < correction.variance < 100.0
@@ -298,10 +300,11 @@ def test_a_heading_s_spread_is_between_its_variance_and_100_in_every_attitude(ro
 @pytest.mark.parametrize("tilt", [0.0, 0.7, -1.2])
 def test_the_derivative_of_yaw_is_that_of_a_difference(tilt):
     estimator = aligned_filter(std=0.01)
-    estimator._correction = tuple(quaternion_from_euler(0.4, tilt, 1.0))
+    estimator.set_attitude(quaternion_from_euler(0.4, tilt, 1.0))
     for axis in range(3):
-        estimator._covariance = np.zeros((STATES, STATES))
-        estimator._covariance[axis, axis] = 1e-6
+        covariance = np.zeros((STATES, STATES))
+        covariance[axis, axis] = 1e-6
+        estimator.set_covariance(covariance)
         turned = quaternion_from_euler(*(1e-5 * np.eye(3)[axis]))
         matrix_nb = matrix_from_quaternion(turned) @ estimator.matrix
         slope = (math.atan2(matrix_nb[1, 0], matrix_nb[0, 0]) - 1.0) / 1e-5
@@ -316,8 +319,10 @@ def test_the_derivative_of_yaw_is_that_of_a_difference(tilt):
 def test_two_degrees_of_tilt_are_gone_within_four_seconds_while_spinning(spin):
     estimator, aiding = aligned_filter(), Aiding()
     truth = quaternion_from_euler(0.0, 0.0, 0.0)
-    estimator._correction = tuple(quaternion_from_euler(math.radians(2.0), 0.0, 0.0))
-    estimator._covariance[ATTITUDE, ATTITUDE] = np.eye(3) * 0.05**2
+    estimator.set_attitude(quaternion_from_euler(math.radians(2.0), 0.0, 0.0))
+    covariance = estimator.covariance
+    covariance[ATTITUDE, ATTITUDE] = np.eye(3) * 0.05**2
+    estimator.set_covariance(covariance)
     for _ in range(400):
         estimator.predict(fused([0.0, 0.0, spin]), DT)
         aiding.take(estimator, fused([0.0, 0.0, spin]), -DOWN, DT)
@@ -347,7 +352,7 @@ def test_no_tilt_is_so_wrong_that_gravity_stays_locked_out(angle):
     for _ in range(300):
         run(estimator, 0.1)
         estimator.correct_gravity(Gravity(estimator.matrix @ DOWN, 0.003, 0.003))
-    estimator._correction = tuple(quaternion_from_euler(math.radians(angle), 0.0, 0.0))
+    estimator.set_attitude(quaternion_from_euler(math.radians(angle), 0.0, 0.0))
     for _ in range(100):
         run(estimator, 0.1)
         gravity_n = estimator.matrix @ DOWN  # the body is level in truth

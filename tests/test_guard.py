@@ -14,7 +14,9 @@ from risaf_link.core.eskf import LATE, Eskf, Gravity
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.guard import HeadingGuard, Whiteness
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingParameters
-from risaf_link.core.rotation import wrap
+from risaf_link.core.rotation import left_matrix, quaternion_from_euler, wrap
+
+pytestmark = pytest.mark.usefixtures("filter_form")
 
 DT = 0.02
 NAN = math.nan
@@ -50,7 +52,7 @@ class Ride:
         noise = np.full(3, GYRO_NOISE**2)
         walk = np.full(3, 5e-6)
         self.filter.predict(FusedRate(0, rate_b, noise, np.full(3, 1), 1, noise, walk), DT)
-        if isinstance(self.filter, Eskf) and round(self.time / DT) % 50 == 0:
+        if not isinstance(self.filter, PaperFilter) and round(self.time / DT) % 50 == 0:
             noise_n = np.array([*0.05 * self.generator.normal(size=2), 0.0])
             self.filter.correct_gravity(Gravity(self.filter.matrix @ (DOWN + noise_n), 0.01, 0.01))
 
@@ -162,8 +164,8 @@ def test_a_receiver_that_is_later_than_told_is_found_out_in_turns(delay):
     ride = Ride(delay=delay).begin()
     for _ in range(5):
         ride.go(4.0, 0.4).go(4.0, -0.4)
-    assert ride.parameters.delay + ride.filter._wrong[1] == pytest.approx(delay, abs=0.03)
-    assert math.sqrt(ride.filter._covariance[LATE, LATE]) < 0.03
+    assert ride.parameters.delay + ride.filter.heading_errors[1] == pytest.approx(delay, abs=0.03)
+    assert math.sqrt(ride.filter.covariance[LATE, LATE]) < 0.03
     assert ride.honesty < 1.5
     assert ride.resets == 1
 
@@ -383,7 +385,8 @@ def test_yaw_is_defended_for_as_long_as_it_was_confirmed(confirmed, patience):
 def test_after_an_outage_headings_that_agree_set_yaw_within_ten_seconds():
     ride = Ride().begin()
     ride.go(100.0, gps=False)
-    ride.filter._turn((0.0, 0.0, math.radians(20.0)))
+    turned = quaternion_from_euler(0.0, 0.0, math.radians(20.0))
+    ride.filter.set_attitude(left_matrix(turned) @ ride.filter.quaternion)
     assert abs(ride.errors[-1]) < 20.0 * ride.filter.state(0).yaw_std
     ride.go(9.0, 0.05)
     assert ride.resets == 1

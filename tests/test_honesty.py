@@ -14,6 +14,8 @@ from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.robust import Robust
 from risaf_link.core.rotation import matrix_from_quaternion, quaternion_from_euler, wrap
 
+pytestmark = pytest.mark.usefixtures("filter_form")
+
 SEEDS = range(50)
 SENSORS, DT, SECONDS = 15, 0.1, 60.0
 OUTAGE = 40.0  # s, from here on
@@ -113,7 +115,7 @@ def simulate(seed, fault):
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["sound", "faulty"])
-def runs(request):
+def runs(request, filter_form):  # noqa: ARG001 which form is run is its doing
     return [simulate(seed, request.param) for seed in SEEDS]
 
 

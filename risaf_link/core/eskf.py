@@ -213,6 +213,21 @@ class Eskf:
         """Covariance of the error, (29, 29): `ATTITUDE`, `GYRO`, `ACCELEROMETER`, `HEADING`."""
         return self._covariance.copy()
 
+    @property
+    def heading_errors(self) -> Floats:
+        """What the headings are held to be off by: rad, s."""
+        return self._wrong
+
+    def set_attitude(self, q_nb: Floats) -> None:
+        """Take an attitude for known."""
+        w, x, y, z = self._by_rate
+        a, b, c, d = q_nb.tolist()
+        self._correction = quaternion.product((a, b, c, d), (w, -x, -y, -z))
+
+    def set_covariance(self, covariance: Floats) -> None:
+        """Take a covariance for that of the error, (29, 29)."""
+        self._covariance = covariance.copy()
+
     def predict(self, fused: FusedRate, dt: float) -> None:
         """Carry the state on to the time of a fused rate.
 
@@ -545,12 +560,13 @@ class Eskf:
     def _gain(self, row: Floats, variance: float) -> Floats:
         """Gain of a scalar measurement; the covariance is updated in the form of Bucy and Joseph.
 
-        As a sum of squares it stays symmetric and positive.
+        `(1 - gain row) P (1 - gain row)' + variance gain gain'` stays symmetric and positive; its
+        two products are each a matrix less one of rank one.
         """
         column = self._covariance @ row
         gain: Floats = column / (float(row @ column) + variance)
-        remaining = IDENTITY - np.outer(gain, row)
-        covariance = remaining @ self._covariance @ remaining.T + variance * np.outer(gain, gain)
+        remaining = self._covariance - np.outer(gain, column)
+        covariance = remaining - np.outer(remaining @ row, gain) + variance * np.outer(gain, gain)
         self._covariance = (covariance + covariance.T) / 2.0
         return gain
 

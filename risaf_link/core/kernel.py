@@ -4,14 +4,17 @@ The NumPy forms stay the statement of what is done, and run where nothing was bu
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from risaf_link.core import fusion, robust
+from risaf_link.core import aiding, eskf, fusion, quaternion, robust
+from risaf_link.core.attitude import AttitudeParameters, AttitudeState
+from risaf_link.core.eskf import USUAL_HEADING, Correction, Gravity, Outcome
 from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
+from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.health import SILENT_AFTER, ArrayHealth, SilenceMonitor
 from risaf_link.core.rotation import Floats
 
@@ -93,6 +96,130 @@ class _Robust:
         return _fused(time_us, self._kernel.fuse(dt, readings))
 
 
+_SOURCES = ("heading", "gravity", "size", "rest")
+_OUTCOMES = tuple(Outcome)
+_BY_AXIS = ("QUIET", "LOOSE", "STRICT")
+
+Told = tuple[float, float, float, bool, int, int]
+
+
+def _numbers(parameters: AttitudeParameters, heading: HeadingParameters) -> Any:
+    """Parameters of the filter, and the constants of its modules, for the kernel."""
+    constants = {**vars(eskf), **vars(aiding), **structs.asdict(parameters)}
+    constants |= {name: constants[name].tolist() for name in _BY_AXIS}
+    constants |= {"offset_std": heading.offset_std, "delay_std": heading.delay_std}
+    return _kernel.FilterNumbers(constants)
+
+
+def _correction(told: Told) -> Correction:
+    value, variance, gate, reset, source, outcome = told
+    return Correction(value, variance, gate, reset, _SOURCES[source], _OUTCOMES[outcome])
+
+
+class _Eskf:
+    """`eskf.Eskf` in C++."""
+
+    def __init__(
+        self, parameters: AttitudeParameters, heading: HeadingParameters = USUAL_HEADING
+    ) -> None:
+        self.kernel = _kernel.Eskf(_numbers(parameters, heading))
+
+    @property
+    def quaternion(self) -> Floats:
+        """`q_nb` as of the last predict."""
+        return self.kernel.state()[0]
+
+    @property
+    def matrix(self) -> Floats:
+        """`R_nb` as of the last predict."""
+        w, x, y, z = self.quaternion.tolist()
+        return quaternion.matrix((w, x, y, z))
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance of the error, (29, 29)."""
+        return self.kernel.covariance()
+
+    @property
+    def heading_errors(self) -> Floats:
+        """What the headings are held to be off by: rad, s."""
+        return np.array(self.kernel.wrong)
+
+    def set_latitude(self, latitude: float) -> None:
+        """Tell where on earth the vehicle is, rad."""
+        self.kernel.set_latitude(latitude)
+
+    def set_attitude(self, q_nb: Floats) -> None:
+        """Take an attitude for known."""
+        self.kernel.set_attitude(q_nb.tolist())
+
+    def set_covariance(self, covariance: Floats) -> None:
+        """Take a covariance for that of the error, (29, 29)."""
+        self.kernel.set_covariance(covariance)
+
+    def predict(self, fused: FusedRate, dt: float) -> None:
+        """Carry the state on to the time of a fused rate."""
+        self.kernel.predict(fused.rate_b, fused.noise, fused.bias_walk, dt)
+
+    def compare_heading(
+        self, heading: float, variance: float, age: float, gate: float
+    ) -> Correction | None:
+        """Hold a heading against the state, which stays as it is; None: it cannot be."""
+        told = self.kernel.compare_heading(heading, variance, age, gate)
+        return None if told is None else _correction(told)
+
+    def correct_heading(
+        self, heading: float, variance: float, age: float, gate: float
+    ) -> Correction:
+        """Fuse a heading; the first one sets yaw."""
+        return _correction(self.kernel.correct_heading(heading, variance, age, gate))
+
+    def reset_heading(self, heading: float, variance: float, age: float, gate: float) -> Correction:
+        """Set yaw by a heading, whatever it was."""
+        return _correction(self.kernel.reset_heading(heading, variance, age, gate))
+
+    def correct_gravity(self, gravity: Gravity) -> tuple[Correction, ...]:
+        """Fuse the direction of gravity; the first one sets the tilt."""
+        g = gravity
+        told = self.kernel.correct_gravity(
+            g.gravity_n, g.forward, g.right, g.down, g.lever, g.by_errors
+        )
+        return tuple(map(_correction, told))
+
+    def correct_zero_rate(
+        self, rate_b: Floats, variance: Floats, confirmed: bool
+    ) -> tuple[Correction, ...]:
+        """Fuse the mean rate of a vehicle at rest."""
+        return tuple(map(_correction, self.kernel.correct_zero_rate(rate_b, variance, confirmed)))
+
+    def state(self, time_us: int) -> AttitudeState:
+        """Read the estimate as of the last predict."""
+        q_nb, rate_b, bias_b, (roll, pitch, yaw), aligned, resets = self.kernel.state()
+        return AttitudeState(time_us, q_nb, rate_b, bias_b, roll, pitch, yaw, aligned, resets)
+
+
+class _SpeedTracker(_kernel.SpeedTracker if BUILT else object):  # type: ignore[misc]
+    """`aiding.SpeedTracker` in C++."""
+
+    def __init__(self) -> None:
+        super().__init__(_numbers(AttitudeParameters(), USUAL_HEADING))
+
+
+class _Aiding:
+    """`aiding.Aiding` in C++."""
+
+    def __init__(self, parameters: AttitudeParameters = aiding.USUAL) -> None:
+        self.kernel = _kernel.Aiding(_numbers(parameters, USUAL_HEADING))
+        self.speed = self.kernel.speed
+
+    def take(
+        self, attitude: _Eskf, fused: FusedRate, force_b: Floats, dt: float
+    ) -> tuple[Correction, ...]:
+        """Correct the attitude after a predict, where there is something to correct it by."""
+        told = self.kernel.take(attitude.kernel, fused.rate_b, force_b, dt)
+        return tuple(map(_correction, told))
+
+
 def _fused(time_us: int, parts: tuple[Floats, NDArray[np.int64], int]) -> FusedRate:
     (rate, variance, noise, bias_walk), active, valid = parts
     return FusedRate(time_us, rate, variance, active, valid, noise, bias_walk)
@@ -100,3 +227,10 @@ def _fused(time_us: int, parts: tuple[Floats, NDArray[np.int64], int]) -> FusedR
 
 Risaf: Callable[[FusionParameters], Fusion] = _Risaf if BUILT else fusion.Risaf
 Robust = _Robust if BUILT else robust.Robust
+if TYPE_CHECKING or not BUILT:
+    from risaf_link.core.aiding import Aiding, SpeedTracker
+    from risaf_link.core.eskf import Eskf
+else:
+    Eskf, Aiding, SpeedTracker = _Eskf, _Aiding, _SpeedTracker
+
+__all__ = ["BUILT", "Aiding", "Eskf", "Risaf", "Robust", "SpeedTracker"]

@@ -6,9 +6,7 @@ import numpy as np
 from msgspec import structs
 
 from risaf_link.core import kernel
-from risaf_link.core.aiding import Aiding
 from risaf_link.core.attitude import AttitudeParameters, PaperFilter
-from risaf_link.core.eskf import Eskf
 from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters, Mean
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, wrap
@@ -20,14 +18,14 @@ from risaf_link.pipeline import FORCE_RESOLUTION, NO_FORCE
 class Ours(Aided):
     """The service's own: `Robust`, `Eskf`, and `Aiding` by gravity, speed and rest."""
 
-    attitude: Eskf
+    attitude: kernel.Eskf
 
     def __init__(self, _: ArrayModel) -> None:
         parameters, fusion = AttitudeParameters(), FusionParameters()
-        super().__init__(Eskf(parameters, HeadingParameters()))
+        super().__init__(kernel.Eskf(parameters, HeadingParameters()))
         self.fusion = kernel.Robust(fusion)
         self._force_fusion = kernel.Robust(structs.replace(fusion, resolution=FORCE_RESOLUTION))
-        self._aiding = Aiding(parameters)
+        self._aiding = kernel.Aiding(parameters)
 
     def step(self, epoch: Epoch) -> None:
         """Carry the estimate on to an epoch."""

@@ -24,8 +24,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from risaf_link.core.attitude import Innovation
-from risaf_link.core.eskf import Eskf
+from risaf_link.core.attitude import Innovation, PaperFilter
 from risaf_link.core.fusion import Epoch, FusedRate
 from risaf_link.core.guard import Estimator, HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion
@@ -135,7 +134,8 @@ class Aided:
 
     def __init__(self, attitude: Estimator) -> None:
         self.attitude = attitude
-        self.guard = HeadingGuard(HeadingParameters(), filter_knows=isinstance(attitude, Eskf))
+        knows = not isinstance(attitude, PaperFilter)
+        self.guard = HeadingGuard(HeadingParameters(), filter_knows=knows)
         self._state = attitude.state(0)
 
     def advance(self, fused: FusedRate, dt: float, force_b: Floats = NO_FORCE) -> None:

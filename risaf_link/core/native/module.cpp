@@ -3,24 +3,15 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include "module.hpp"
 #include "risaf.hpp"
 #include "robust.hpp"
 
-namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
 
 using Readings = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-template <typename T>
-using Array = nb::ndarray<nb::numpy, T>;
-
-template <typename T>
-Array<T> owned(T* values, std::initializer_list<std::size_t> shape) {
-  nb::capsule owner(values, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-  return Array<T>(values, shape, owner);
-}
-
 template <typename Fusion>
 nb::tuple fuse(Fusion& fusion, double dt, const Readings& readings) {
   risaf::FusedAxis fused[3];
@@ -125,4 +116,6 @@ NB_MODULE(_kernel, m) {
       .def("trusted", [](const risaf::Robust& robust) {
         return channels(robust, &risaf::Robust::Axis::trusted);
       });
+
+  bind_filter(m);
 }

@@ -1,0 +1,176 @@
+// The filter, its aiding, and the step from readings to attitude, for Python.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "aiding.hpp"
+#include "eskf.hpp"
+#include "estimator.hpp"
+#include "module.hpp"
+#include "risaf.hpp"
+#include "robust.hpp"
+
+using namespace nb::literals;
+
+namespace {
+
+using risaf::Aiding;
+using risaf::Eskf;
+using risaf::FilterNumbers;
+using risaf::SpeedTracker;
+using risaf::Vector;
+
+template <typename... Shape>
+using Floats = nb::ndarray<const double, Shape..., nb::c_contig, nb::device::cpu>;
+using Three = Floats<nb::shape<3>>;
+using ByErrors = Floats<nb::shape<3, 12>>;
+using Told = std::vector<std::tuple<double, double, double, bool, int, int>>;
+
+Vector vector(const Three& v) { return {v.data()[0], v.data()[1], v.data()[2]}; }
+
+FilterNumbers numbers(const nb::dict& told) {
+  FilterNumbers c;
+#define RISAF_TAKE(name) c.name = nb::cast<double>(told[#name]);
+  RISAF_FILTER_NUMBERS(RISAF_TAKE)
+#undef RISAF_TAKE
+  c.HISTORY = nb::cast<std::size_t>(told["HISTORY"]);
+  c.PARTS = nb::cast<std::size_t>(told["PARTS"]);
+  c.QUIET = nb::cast<std::array<double, 6>>(told["QUIET"]);
+  c.LOOSE = nb::cast<std::array<double, 6>>(told["LOOSE"]);
+  c.STRICT = nb::cast<std::array<double, 6>>(told["STRICT"]);
+  return c;
+}
+
+nb::tuple told(const risaf::Correction& c) {
+  return nb::make_tuple(c.value, c.variance, c.gate, c.reset, static_cast<int>(c.source),
+                        static_cast<int>(c.outcome));
+}
+
+nb::list told(const risaf::Corrections& corrections) {
+  nb::list all;
+  for (const risaf::Correction& correction : corrections) {
+    all.append(told(correction));
+  }
+  return all;
+}
+
+nb::object compare_heading(const Eskf& filter, double heading, double variance, double age,
+                           double gate) {
+  risaf::Correction compared;
+  if (!filter.compare_heading(heading, variance, age, gate, compared)) {
+    return nb::none();
+  }
+  return told(compared);
+}
+
+void predict(Eskf& filter, const Three& rate, const Three& noise, const Three& bias_walk,
+             double dt) {
+  risaf::FusedAxis fused[3];
+  for (std::size_t k = 0; k < 3; ++k) {
+    fused[k] = {rate.data()[k], risaf::NaN, noise.data()[k], bias_walk.data()[k], 0};
+  }
+  filter.predict(fused, dt);
+}
+
+nb::list correct_gravity(Eskf& filter, const Three& gravity_n, double forward, double right,
+                         double down, const ByErrors& lever, const ByErrors& by_errors) {
+  risaf::Gravity gravity{vector(gravity_n), forward, right, down, {}, {}};
+  for (std::size_t i = 0; i < 3; ++i) {
+    std::copy_n(lever.data() + 12 * i, 12, gravity.lever[i].begin());
+    std::copy_n(by_errors.data() + 12 * i, 12, gravity.by_errors[i].begin());
+  }
+  return told(filter.correct_gravity(gravity));
+}
+
+Array<double> covariance(const Eskf& filter) {
+  auto* values = new double[risaf::STATES * risaf::STATES];
+  for (std::size_t i = 0; i < risaf::STATES; ++i) {
+    for (std::size_t j = 0; j < risaf::STATES; ++j) {
+      values[risaf::STATES * i + j] = filter.covariance(i, j);
+    }
+  }
+  return owned(values, {risaf::STATES, risaf::STATES});
+}
+
+// q_nb, rate, bias, standard deviations of the angles, aligned, resets.
+nb::tuple state(const Eskf& filter) {
+  const auto [w, x, y, z] = filter.attitude();
+  const Vector &rate = filter.rate(), &bias = filter.bias();
+  return nb::make_tuple(owned(new double[4]{w, x, y, z}, {4}),
+                        owned(new double[3]{rate[0], rate[1], rate[2]}, {3}),
+                        owned(new double[3]{bias[0], bias[1], bias[2]}, {3}), filter.angle_std(),
+                        filter.aligned(), filter.resets());
+}
+
+template <typename Fusion>
+Array<double> advance(Fusion& gyros, risaf::Robust& accelerometers, Eskf& filter, Aiding& aiding,
+                      const Floats<nb::shape<-1>>& dt, const Floats<nb::shape<-1, -1, 3>>& rates_b,
+                      const Floats<nb::shape<-1, -1, 3>>& forces_b) {
+  constexpr std::size_t COLUMNS = sizeof(risaf::Known) / sizeof(double);
+  const std::size_t epochs = dt.shape(0);
+  if (rates_b.shape(0) != epochs || forces_b.shape(0) != epochs) {
+    throw nb::value_error("dt, rates_b, forces_b: found different lengths, expected one");
+  }
+  auto* values = new double[COLUMNS * epochs];
+  const nb::gil_scoped_release others_may_run;
+  risaf::advance(gyros, accelerometers, filter, aiding, epochs, dt.data(), rates_b.data(),
+                 rates_b.shape(1), forces_b.data(), forces_b.shape(1),
+                 reinterpret_cast<risaf::Known*>(values));
+  const nb::gil_scoped_acquire back;
+  return owned(values, {epochs, COLUMNS});
+}
+
+}  // namespace
+
+void bind_filter(nb::module_& m) {
+  nb::class_<FilterNumbers>(m, "FilterNumbers").def("__init__", [](FilterNumbers* self, const nb::dict& told) {
+    new (self) FilterNumbers(numbers(told));
+  });
+
+  nb::class_<Eskf>(m, "Eskf")
+      .def(nb::init<const FilterNumbers&>())
+      .def("set_latitude", &Eskf::set_latitude)
+      .def("set_attitude", [](Eskf& filter, const std::array<double, 4>& q) {
+        filter.set_attitude({q[0], q[1], q[2], q[3]});
+      })
+      .def("set_covariance", [](Eskf& filter, const Floats<nb::shape<29, 29>>& covariance) {
+        filter.set_covariance(covariance.data());
+      })
+      .def("predict", &predict)
+      .def("compare_heading", &compare_heading)
+      .def("correct_heading", [](Eskf& filter, double heading, double variance, double age, double gate) {
+        return told(filter.correct_heading(heading, variance, age, gate));
+      })
+      .def("reset_heading", [](Eskf& filter, double heading, double variance, double age, double gate) {
+        return told(filter.reset_heading(heading, variance, age, gate));
+      })
+      .def("correct_gravity", &correct_gravity)
+      .def("correct_zero_rate", [](Eskf& filter, const Three& rate, const Three& variance, bool confirmed) {
+        return told(filter.correct_zero_rate(vector(rate), vector(variance), confirmed));
+      })
+      .def("state", &state)
+      .def("covariance", &covariance)
+      .def_prop_ro("wrong", &Eskf::wrong);
+
+  nb::class_<SpeedTracker>(m, "SpeedTracker")
+      .def(nb::init<const FilterNumbers&>())
+      .def("advance", &SpeedTracker::advance, "dt"_a)
+      .def("hear", &SpeedTracker::hear, "speed"_a, "variance"_a, "age"_a)
+      .def("turn_round", &SpeedTracker::turn_round)
+      .def_ro("speed", &SpeedTracker::speed)
+      .def_ro("acceleration", &SpeedTracker::acceleration)
+      .def_ro("speed_variance", &SpeedTracker::speed_variance)
+      .def_prop_ro("recent", &SpeedTracker::recent);
+
+  nb::class_<Aiding>(m, "Aiding")
+      .def(nb::init<const FilterNumbers&>())
+      .def_prop_ro("speed", [](Aiding& aiding) { return &aiding.speed; }, nb::rv_policy::reference_internal)
+      .def("take", [](Aiding& aiding, Eskf& filter, const Three& rate_b, const Three& force_b, double dt) {
+        return told(aiding.take(filter, vector(rate_b), vector(force_b), dt));
+      });
+
+  m.def("advance", &advance<risaf::Robust>);
+  m.def("advance", &advance<risaf::Risaf>);
+}

@@ -1,0 +1,69 @@
+"""The kernel's filter beside its statement in Python: the same drives, the same numbers."""
+
+import math
+
+import numpy as np
+import pytest
+from filters import DEFAULTS, fused
+
+from risaf_link.core import aiding, eskf, kernel
+from risaf_link.core.earth import GRAVITY
+from risaf_link.core.heading import HeadingParameters
+from risaf_link.core.rotation import wrap
+
+pytestmark = pytest.mark.skipif(
+    not kernel.BUILT, reason="no kernel was built: that takes a C++ compiler"
+)
+
+
+def readings(seed, steps):
+    """What a vehicle reads that stands, drives curves, shakes, and at times falls silent."""
+    generator = np.random.default_rng(seed)
+    forms = generator.uniform(0.1, 0.5, 3), generator.uniform(0.0, 6.0, 3)
+    for step in range(steps):
+        dt = float(generator.choice([0.01, 0.01, 0.01, 0.011, 0.05, 0.7]))
+        moving = step % 4000 > 1500
+        rate = moving * np.array([0.1, 0.1, 0.5]) * np.sin(forms[0] * step / 100 + forms[1])
+        speed = moving * 12.0
+        force = np.array([0.0, speed * rate[2], -GRAVITY]) + 0.05 * generator.normal(size=3)
+        rate = rate + [0.003, -0.002, 0.001] + 0.002 * generator.normal(size=3)
+        if generator.random() < 0.01:
+            rate[generator.integers(3)] = math.nan
+        if step % 5000 > 4500:
+            force[:] = math.nan
+        yield step, dt, rate, force, speed, generator
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_kernel_s_filter_is_that_of_the_python_form(seed):
+    heading = HeadingParameters(offset_std=0.01)
+    filters = [form.Eskf(DEFAULTS, heading) for form in (eskf, kernel)]
+    aids = [form.Aiding(DEFAULTS) for form in (aiding, kernel)]
+    yaw = 1.0
+    for step, dt, rate, force, speed, generator in readings(seed, 8000):
+        yaw = wrap(yaw + float(np.nan_to_num(rate[2])) * dt)
+        corrections = []
+        course = yaw + 0.02 * generator.normal() + (0.5 if step % 1000 > 900 else 0.0)
+        for estimator, aid in zip(filters, aids, strict=True):
+            estimator.predict(fused(rate, dt=dt), dt)
+            made = list(aid.take(estimator, fused(rate, dt=dt), force, dt))
+            if step % 20 == 0 and step % 3000 < 2000:
+                estimator.set_latitude(0.5)
+                made.append(estimator.compare_heading(wrap(course), 4e-4, 0.11, 3.0))
+                made.append(estimator.correct_heading(wrap(course), 4e-4, 0.11, 3.0))
+                aid.speed.hear(speed, 0.01, 0.11)
+            if step % 2900 == 2899:
+                made.append(estimator.reset_heading(wrap(course), 4e-4, 0.11, 3.0))
+            corrections.append(made)
+        for python, native in zip(*corrections, strict=True):
+            if python is None:
+                assert native is None
+                continue
+            assert (python.source, python.outcome) == (native.source, native.outcome)
+            assert native.value == pytest.approx(python.value, rel=1e-9, abs=1e-12)
+            assert native.variance == pytest.approx(python.variance, rel=1e-9)
+        python, native = (estimator.state(0) for estimator in filters)
+        assert np.abs(python.q_nb - native.q_nb).max() < 1e-11
+    deviation = np.sqrt(filters[0].covariance.diagonal())
+    difference = (filters[0].covariance - filters[1].covariance) / np.outer(deviation, deviation)
+    assert np.abs(difference).max() < 1e-11
