@@ -19,12 +19,11 @@ from multiprocessing import Pool
 import numpy as np
 from scipy.signal import butter, lfilter, sosfiltfilt
 
-from risaf_link.core.aiding import Aiding
 from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
-from risaf_link.core.eskf import Eskf
-from risaf_link.core.fusion import Epoch, FusionParameters
-from risaf_link.core.robust import Robust
+from risaf_link.core.estimator import Estimator
+from risaf_link.core.fusion import FusionParameters
+from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, matrix_from_quaternion
 
 RATE = 286.0  # Hz
@@ -196,19 +195,11 @@ def _misread(values: Floats, bias: Floats, noise: float, generator: np.random.Ge
 
 def by_eskf(one: Trial) -> Floats:
     """Verticals in body axes, shape (n, 3), by the package's own chain."""
-    parameters = AttitudeParameters()
-    fusion, force_fusion = Robust(FusionParameters()), Robust(FusionParameters(resolution=0.02))
-    estimator, aiding = Eskf(parameters), Aiding()
-    downs = np.empty_like(one.down_b)
-    dt = 1.0 / RATE
-    for k, (rate_b, force_b) in enumerate(zip(one.rates_b, one.forces_b, strict=True)):
-        epoch = Epoch(round(k * 1e6 * dt), dt if k else 0.0, rate_b[None], force_b[None], 0)
-        fused = fusion.fuse(epoch)
-        force = force_fusion.fuse_readings(epoch.time_us, epoch.dt, epoch.forces_b).rate_b
-        estimator.predict(fused, epoch.dt)
-        aiding.take(estimator, fused, force, epoch.dt)
-        downs[k] = estimator.matrix[2]
-    return downs
+    estimator = Estimator(FusionParameters(), AttitudeParameters(), HeadingParameters())
+    dt = np.full(len(one.rates_b), 1.0 / RATE)
+    dt[0] = 0.0
+    track = estimator.advance(dt, one.rates_b[:, np.newaxis], one.forces_b[:, np.newaxis])
+    return matrix_from_quaternion(track.q_nb)[:, 2]
 
 
 def by_vqf(one: Trial) -> Floats:

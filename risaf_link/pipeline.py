@@ -7,35 +7,22 @@ Nothing here reads a clock, opens a file or waits. A live link and a log feed th
 that a live run that is recorded and replayed gives the same estimates, bit for bit.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import numpy as np
 from msgspec import Struct, field, structs
 
-from risaf_link.core import kernel
 from risaf_link.core.array import ArrayCalibration, Calibration
-from risaf_link.core.attitude import AttitudeParameters, PaperFilter
-from risaf_link.core.estimate import ArrayStatus, Estimate
-from risaf_link.core.fusion import Epoch, Fusion, FusionParameters, Mean, Median
-from risaf_link.core.guard import HeadingGuard
+from risaf_link.core.attitude import AttitudeParameters
+from risaf_link.core.estimate import ArrayStatus, Estimate, EstimateBlock
+from risaf_link.core.estimator import Estimator
+from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import ArrayHealth
-from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.ingest import GpsParameters, Ingest
 
-FUSIONS: dict[str, Callable[[FusionParameters], Fusion]] = {
-    "robust": kernel.Robust,
-    "risaf": kernel.Risaf,
-    "median": Median,
-    "mean": Mean,
-}
-FORCE_RESOLUTION = 0.02  # m/s^2; no accelerometer is blamed for less
 HEALTH_PERIOD = 0.1  # s, from one judgement of the sensors to the next
-NO_FORCE = np.full(3, np.nan)
 
 
 class PipelineParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -79,20 +66,10 @@ class Pipeline:
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
         self._clock = VehicleClock()
-        self._fusion = FUSIONS[p.fusion.method](p.fusion)
-        self._force_fusion = kernel.Robust(structs.replace(p.fusion, resolution=FORCE_RESOLUTION))
-        self._health = self._fusion.health()
+        self._estimator = Estimator(p.fusion, p.attitude, p.heading)
+        self._health = self._estimator.fusion.health()
         self._judged = 0.0  # s, when it was made
-        self._filter: kernel.Eskf | PaperFilter
-        self._aiding: kernel.Aiding | None = None
-        if p.attitude.filter == "eskf":
-            self._filter = kernel.Eskf(p.attitude, p.heading)
-            self._aiding = kernel.Aiding(p.attitude)
-        else:
-            self._filter = PaperFilter(p.attitude)
-        self._heading = p.heading
         self._finder = HeadingFinder(p.heading)
-        self._guard = HeadingGuard(p.heading, filter_knows=self._aiding is not None)
         self._monitor = HeadingMonitor(p.heading)
         self._elapsed = 0.0  # s, of epochs
 
@@ -110,7 +87,7 @@ class Pipeline:
         if isinstance(datum, GyroChunk):
             return self._estimates(self.assembler.add(datum), received_us)
         if isinstance(datum, GpsFix):
-            self._aid(datum)
+            self._correct(datum)
         return []
 
     def flush(self, received_us: int) -> list[Estimate]:
@@ -118,82 +95,63 @@ class Pipeline:
         return self._estimates(self.assembler.flush(), received_us)
 
     def _estimates(self, epochs: list[Epoch], received_us: int) -> list[Estimate]:
-        fitting = [epoch for epoch in epochs if self._fits(epoch)]
-        return [self._advance(self._calibrated(epoch), received_us) for epoch in fitting]
+        blocks = [self.advance(EpochBlock.of(epoch, received_us)) for epoch in epochs]
+        return [block.at(0) for block in blocks if block]
 
-    def _advance(self, epoch: Epoch, received_us: int) -> Estimate:
-        """Carry the estimate on to an epoch."""
-        fused = self._fusion.fuse(epoch)
-        self._elapsed += epoch.dt
-        self._filter.predict(fused, epoch.dt)
-        force_b = self._force(epoch)
-        if self._aiding and not isinstance(self._filter, PaperFilter):
-            self._aiding.take(self._filter, fused, force_b, epoch.dt)
-        self._monitor.advance(epoch.dt)
-        attitude = self._filter.state(epoch.time_us)
-        attitude = self._guard.advance(attitude, force_b, epoch.dt)
-        return Estimate(
-            epoch.time_us,
-            self._clock.boot_us(epoch.time_us, received_us),
-            self._elapsed,
-            fused,
-            attitude,
-            self._monitor.status(attitude),
-            self._array_status(epoch),
+    def advance(self, epochs: EpochBlock) -> EstimateBlock | None:
+        """Carry the estimate on over epochs between which no fix came; None: they do not fit."""
+        sensors = epochs.rates_b.shape[1]
+        if not self._fits(sensors):
+            return None
+        rates_b, forces_b = epochs.rates_b, epochs.forces_b
+        if self._calibration:
+            rates_b, forces_b = self._calibration.apply(rates_b, forces_b)
+        track = self._estimator.advance(epochs.dt, rates_b, forces_b)
+        elapsed = np.cumsum(np.concatenate(([self._elapsed], epochs.dt)))[1:]
+        self._elapsed = float(elapsed[-1])
+        times = zip(epochs.time_us.tolist(), epochs.received_us.tolist(), strict=True)
+        return EstimateBlock(
+            epochs.time_us,
+            epochs.received_us,
+            np.array([self._clock.boot_us(*time) for time in times]),
+            elapsed,
+            track,
+            self._monitor.advance(epochs.dt, track.aligned),
+            self._array_status(sensors),
         )
 
-    def _aid(self, fix: GpsFix) -> None:
+    def _correct(self, fix: GpsFix) -> None:
         """Correct the attitude by a GPS fix."""
         motion = self._finder.take(fix, self._elapsed)
         self._monitor.note_motion(motion)
-        gear = self._guard.gear.sign
-        innovation = self._guard.take(self._filter, motion)
+        innovation = self._estimator.correct(motion, fix.latitude)
         if innovation and motion.heading:
             self._monitor.note_innovation(motion.heading, innovation)
-        if self._aiding and not isinstance(self._filter, PaperFilter):
-            self._filter.set_latitude(fix.latitude)
-            if self._guard.gear.sign != gear:
-                self._aiding.speed.turn_round()
-            if motion.along and motion.is_news and not motion.contradicted:
-                ahead = self._guard.ahead(motion)
-                self._aiding.speed.hear(ahead, motion.speed_std**2, self._heading.delay)
 
-    def _array_status(self, epoch: Epoch) -> ArrayStatus:
+    def _array_status(self, sensors: int) -> ArrayStatus:
         counts, source = self.assembler.counts, self.assembler.source
         return ArrayStatus(
             source.array_id if source else 0,
             counts["epochs"],
             counts["incomplete"],
             counts["samples_lost"],
-            len(epoch.rates_b),
-            self._judge(len(epoch.rates_b)),
+            sensors,
+            self._judge(sensors),
         )
 
     def _judge(self, sensors: int) -> ArrayHealth:
         """Standing of the sensors, judged anew now and then."""
         due = self._elapsed - self._judged >= HEALTH_PERIOD
         if due or len(self._health.state) != sensors:
-            self._health, self._judged = self._fusion.health(), self._elapsed
+            self._health, self._judged = self._estimator.fusion.health(), self._elapsed
         return self._health
 
-    def _force(self, epoch: Epoch) -> Floats:
-        """Fused specific force, m/s^2; NaN: there is no accelerometer."""
-        if not len(epoch.forces_b):
-            return NO_FORCE
-        return self._force_fusion.fuse_readings(epoch.time_us, epoch.dt, epoch.forces_b).rate_b
-
-    def _fits(self, epoch: Epoch) -> bool:
+    def _fits(self, sensors: int) -> bool:
         if self._calibration is None:
             return True
         source = self.assembler.source
         info = source and self.ingest.info(source)
         self.mismatch = self._calibration.mismatch(
-            max(len(epoch.rates_b), info.sensors if info else 0), info.name if info else ""
+            max(sensors, info.sensors if info else 0), info.name if info else ""
         )
         return not self.mismatch
-
-    def _calibrated(self, epoch: Epoch) -> Epoch:
-        if self._calibration is None:
-            return epoch
-        rates_b, forces_b = self._calibration.apply(epoch.rates_b, epoch.forces_b)
-        return replace(epoch, rates_b=rates_b, forces_b=forces_b)

@@ -15,11 +15,13 @@ from risaf_link.core.fusion import FusedRate
 from risaf_link.core.guard import HeadingGuard, Whiteness
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingParameters
 from risaf_link.core.rotation import left_matrix, quaternion_from_euler, wrap
+from risaf_link.core.track import Track
 
 pytestmark = pytest.mark.usefixtures("filter_form")
 
 DT = 0.02
 NAN = math.nan
+NONE = np.full(3, NAN)
 PARAN = (math.radians(30.2217), math.radians(34.8012))
 SPEED_NOISE, GYRO_NOISE = 0.1, 1e-3
 DOWN = np.array([0.0, 0.0, GRAVITY])
@@ -87,7 +89,10 @@ class Ride:
             self.east += self.speed * math.sin(self.yaw) * DT
             self.predict(rate)
             force_b = np.array([gain, rate * self.speed, -GRAVITY])
-            self.state = self.guard.advance(self.filter.state(0), force_b, DT)
+            fused = FusedRate(0, NONE, NONE, np.zeros(3, np.int64), 1, NONE, NONE)
+            track = Track.of([(fused, self.filter.state(0), force_b)])
+            self.guard.advance(track, np.array([DT]))
+            self.state = track.attitude(0, 0)
             self.late.append((self.time, self.fix(rate)))
             if gps and round(self.time / DT) % 10 == 0:
                 motion = self.finder.take(spoil(self.late[0][1]), self.time)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from ellipsoid import away, earth_centred, north_east
 from numpy import zeros
@@ -279,7 +280,7 @@ class Account:
 
     def wait(self, seconds, dt=0.1):
         for _ in range(round(seconds / dt)):
-            self.monitor.advance(dt)
+            self.monitor.advance(np.array([dt]), np.array([self.resets > 0]))
 
     def fix(self, motion, innovation=None):
         self.monitor.note_motion(motion)
@@ -298,7 +299,7 @@ class Account:
         attitude = AttitudeState(
             7, zeros(4) + 0.5, zeros(3), zeros(3), 0.1, 0.1, 0.2, self.resets > 0, self.resets
         )
-        return self.monitor.status(attitude)
+        return self.monitor.advance(zeros(1), np.array([attitude.aligned])).at(0, attitude)
 
     @property
     def state(self):

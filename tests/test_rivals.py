@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from risaf_link.core.attitude import AttitudeParameters, PaperFilter
-from risaf_link.core.fusion import Epoch
+from risaf_link.core.fusion import Epoch, FusionParameters, Mean
 from risaf_link.core.heading import Heading, HeadingParameters, HeadingSource, Motion
 from risaf_link.errors import ConfigError
 from risaf_link.experiments.case import Case, scenario_of
@@ -14,7 +14,7 @@ from risaf_link.experiments.catalogue import METHODS, make, read_own
 from risaf_link.experiments.central import RATE, Centralised, Compact, Direct
 from risaf_link.experiments.gyro_filters import Integration, MeanEkf, SingleEkf, Virtual
 from risaf_link.experiments.inputs import array_model, instants
-from risaf_link.experiments.method import ArrayModel, Gps, HeadingGate
+from risaf_link.experiments.method import Aided, ArrayModel, Gps, HeadingGate
 from risaf_link.experiments.particles import Particles
 from risaf_link.experiments.robust_filters import Correntropy, Huber, Variational
 from risaf_link.experiments.so3 import exp, exps, logs
@@ -106,10 +106,11 @@ def test_the_centralised_filter_is_the_papers_on_the_mean():
     parameters = AttitudeParameters(initial_bias_std=5e-4)
     filtered = Centralised(ARRAY)
 
-    class OfMean(MeanEkf):
+    class OfMean(Aided):
         def __init__(self):
-            super().__init__(ARRAY)
+            super().__init__()
             self.attitude = PaperFilter(parameters)
+            self.fusion = Mean(FusionParameters(method="mean"))
             self.headings = HeadingGate(HeadingParameters())
 
         def step(self, epoch):
@@ -250,13 +251,12 @@ def test_a_covariance_stays_one_in_a_real_drive():
 
 TRIMMED = """
 import numpy as np
-from risaf_link.core.attitude import AttitudeParameters, PaperFilter
 from risaf_link.experiments.method import Aided, one_rate
 
 
 class Trimmed(Aided):
     def __init__(self, array, cut=2.0):
-        super().__init__(PaperFilter(AttitudeParameters()))
+        super().__init__()
         self.cut, self.variance = int(cut), array.noise**2
 
     def step(self, epoch):

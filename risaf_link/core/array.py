@@ -83,23 +83,24 @@ class Calibration:
         return ""
 
     def apply(self, rates_s: Floats, forces_s: Floats) -> tuple[Floats, Floats]:
-        """Correct the readings of one epoch.
+        """Correct the readings of one epoch, or of many.
 
         Parameters
         ----------
-        rates_s, forces_s : ndarray, shapes (n, 3) and (m, 3)
+        rates_s, forces_s : ndarray, shapes (..., n, 3) and (..., m, 3)
             Raw readings, rad/s and m/s^2, each in its sensor's own axes; NaN where not valid. The
             first n and m sensors are meant; n at most as many as are calibrated. Accelerometers
             without a calibration stay as they are.
 
         Returns
         -------
-        rates_b, forces_b : ndarray, shapes (n, 3) and (m, 3)
+        rates_b, forces_b : ndarray, shapes (..., n, 3) and (..., m, 3)
             In the body frame. A reading that is not valid spoils the other axes of its sensor as
             far as they depend on it.
         """
-        calibrated = self._accels.apply(forces_s[: len(self._accels.bias)])
-        return self._gyros.apply(rates_s), np.vstack([calibrated, forces_s[len(calibrated) :]])
+        known = len(self._accels.bias)
+        forces_b = self._accels.apply(forces_s[..., :known, :]), forces_s[..., known:, :]
+        return self._gyros.apply(rates_s), np.concatenate(forces_b, axis=-2)
 
 
 class _Triads:
@@ -119,11 +120,11 @@ class _Triads:
         self._unrelated = self._matrix == 0.0  # (3, 3, n): to, from, sensor
 
     def apply(self, readings_s: Floats) -> Floats:
-        n = len(readings_s)
-        centred = (readings_s - self.bias[:n]).T
+        n = readings_s.shape[-2]
+        centred = np.moveaxis(readings_s - self.bias[:n], -1, -2)[..., np.newaxis, :, :]
         parts = np.where(self._unrelated[:, :, :n], 0.0, self._matrix[:, :, :n] * centred)
-        corrected: Floats = parts.sum(axis=1)
-        return corrected.T
+        corrected: Floats = parts.sum(axis=-2)  # (..., to, n)
+        return np.ascontiguousarray(np.moveaxis(corrected, -1, -2))
 
 
 def _check(where: str, triad: TriadCalibration) -> None:

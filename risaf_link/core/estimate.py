@@ -2,10 +2,15 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from risaf_link.core.attitude import AttitudeState
 from risaf_link.core.fusion import FusedRate
-from risaf_link.core.heading import HeadingStatus
+from risaf_link.core.heading import HeadingStatus, HeadingTrack
 from risaf_link.core.health import ArrayHealth
+from risaf_link.core.rotation import Floats
+from risaf_link.core.track import Track
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,3 +36,33 @@ class Estimate:
     attitude: AttitudeState
     heading: HeadingStatus
     array: ArrayStatus
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateBlock:
+    """The estimator's output at k epochs between which no fix came."""
+
+    time_us: NDArray[np.int64]  # (k,)
+    received_us: NDArray[np.int64]  # (k,) when what made each of them possible came
+    boot_us: NDArray[np.int64]  # (k,)
+    elapsed: Floats  # (k,) s
+    track: Track
+    heading: HeadingTrack
+    array: ArrayStatus  # as of the last epoch
+
+    def __len__(self) -> int:
+        return len(self.time_us)
+
+    def at(self, i: int) -> Estimate:
+        """The output at one epoch."""
+        time_us = int(self.time_us[i])
+        attitude = self.track.attitude(i, time_us)
+        return Estimate(
+            time_us,
+            int(self.boot_us[i]),
+            float(self.elapsed[i]),
+            self.track.fused(i, time_us),
+            attitude,
+            self.heading.at(i, attitude),
+            self.array,
+        )

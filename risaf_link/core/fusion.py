@@ -66,6 +66,28 @@ class Epoch:
 
 
 @dataclass(frozen=True, slots=True)
+class EpochBlock:
+    """k epochs, one after another, of an array that stays as it is."""
+
+    time_us: NDArray[np.int64]  # (k,)
+    received_us: NDArray[np.int64]  # (k,) when what made each of them whole came
+    dt: Floats  # (k,) seconds, each since the epoch before
+    rates_b: Floats  # (k, n, 3) rad/s; NaN: no valid reading
+    forces_b: Floats  # (k, m, 3) m/s^2; m may be 0
+
+    @classmethod
+    def of(cls, epoch: Epoch, received_us: int) -> "EpochBlock":
+        """One epoch alone."""
+        return cls(
+            np.array([epoch.time_us]),
+            np.array([received_us]),
+            np.array([epoch.dt]),
+            epoch.rates_b[np.newaxis],
+            epoch.forces_b[np.newaxis],
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class FusedRate:
     """The array as one gyro."""
 
@@ -116,7 +138,7 @@ class Risaf:
         """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
         p = self._parameters
         rates, valid = _channels(epoch)
-        self._silence.watch(epoch.rates_b, epoch.dt)
+        self._silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
         self._resize(rates.shape[1])
         mean = rates.sum(axis=1, where=valid) / np.maximum(valid.sum(axis=1), 1)
         residual = rates - mean[:, None]
@@ -151,7 +173,7 @@ class Mean:
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
         rates, valid = _channels(epoch)
-        self._silence.watch(epoch.rates_b, epoch.dt)
+        self._silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
         return _mean_of_active(self._parameters, epoch, rates, valid, valid)
 
     def health(self) -> ArrayHealth:
@@ -169,7 +191,7 @@ class Median:
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
         rates, valid = _channels(epoch)
-        self._silence.watch(epoch.rates_b, epoch.dt)
+        self._silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
         (median,) = quantiles(rates, (0.5,))
         (deviation,) = quantiles(np.abs(rates - median[:, None]), (0.5,))
         count = valid.sum(axis=1)

@@ -6,7 +6,7 @@ turns round at speed is no change of gear. And what the accelerometer feels alon
 the change of speed, with the gear's sign.
 """
 
-from collections.abc import Sequence
+import numpy as np
 
 from risaf_link.core.earth import GRAVITY
 from risaf_link.core.rotation import Floats
@@ -42,13 +42,14 @@ class Gear:
         self._lately = 0.0  # and in the window that is not over
         self._right = 0.0  # evidence before, that yaw is not off by half a turn
 
-    def feel(self, q_nb: Floats, force_b: Sequence[float], dt: float) -> None:
-        """Use the specific force of an epoch, (3,), m/s^2; NaN: there is no accelerometer."""
-        w, x, y, z = q_nb.tolist()
-        along = force_b[0] + GRAVITY * 2.0 * (x * z - w * y)
-        if abs(along) < LARGEST_FORCE:
-            self._felt += along * dt
-        else:
+    def feel(self, q_nb: Floats, force_b: Floats, dt: Floats) -> None:
+        """Use the specific force of k epochs, (k, 3) m/s^2; NaN: there is no accelerometer."""
+        w, x, y, z = q_nb.T
+        along = force_b[:, 0] + GRAVITY * 2.0 * (x * z - w * y)
+        felt = np.abs(along) < LARGEST_FORCE
+        gained = np.where(felt, along * dt, 0.0)
+        self._felt = float(np.cumsum(np.concatenate(([self._felt], gained)))[-1])
+        if not felt.all():
             self._begun = None
 
     def hear(self, speed: float, speed_std: float, time_s: float) -> None:

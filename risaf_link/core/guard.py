@@ -18,15 +18,16 @@ that is right. So the headings are judged together.
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from risaf_link.core.attitude import AttitudeState, Innovation, PaperFilter
+from risaf_link.core.attitude import Innovation, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
 from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
 from risaf_link.core.rotation import Floats, wrap
+from risaf_link.core.track import Track
 
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
 MEMORY = 15  # innovations in a mean
@@ -166,22 +167,23 @@ class HeadingGuard:
         self._aligned = False
         self._confirmed = 0.0  # s for which headings have agreed with yaw
 
-    def advance(self, attitude: AttitudeState, force_b: Floats, dt: float) -> AttitudeState:
-        """Take note of an epoch: the filter's state, the specific force, m/s^2, the time, s.
+    def advance(self, track: Track, dt: Floats) -> None:
+        """Take note of k epochs and the time of each, (k,) s.
 
-        Returns
-        -------
-        AttitudeState
-            With the doubt about yaw that headings have left, which no filter knows of.
+        The track is given the doubt about yaw that headings have left, which no filter knows of.
         """
-        self._elapsed += dt
-        self._aligned = attitude.aligned
-        self._turned.append((self._elapsed, self._turned[-1][1] + attitude.rate_b * dt))
-        self.gear.feel(attitude.q_nb, force_b.tolist(), dt)
-        if not self._whiteness.doubt:
-            return attitude
-        yaw_std = math.hypot(attitude.yaw_std, self._whiteness.doubt)
-        return replace(attitude, yaw_std=min(yaw_std, math.pi))
+        if not len(track):
+            return
+        elapsed = np.cumsum(np.concatenate(([self._elapsed], dt)))
+        turns = np.vstack((self._turned[-1][1], track.rate_b * dt[:, np.newaxis]))
+        turned = np.cumsum(turns, axis=0)
+        self._turned.extend(zip(elapsed[1:].tolist(), turned[1:], strict=True))
+        self._elapsed = float(elapsed[-1])
+        self._aligned = bool(track.aligned[-1])
+        self.gear.feel(track.q_nb, track.force_b, dt)
+        if self._whiteness.doubt:
+            doubted = np.hypot(track.yaw_std, self._whiteness.doubt)
+            track.yaw_std[:] = np.minimum(doubted, math.pi)
 
     def take(self, estimator: Estimator, motion: Motion) -> Innovation | None:
         """Use what one fix says; None: it says nothing of heading."""

@@ -10,11 +10,13 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Annotated, Literal
 
+import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
 from risaf_link.core.attitude import AttitudeState, Innovation
 from risaf_link.core.earth import radii
-from risaf_link.core.rotation import wrap
+from risaf_link.core.rotation import Floats, wrap, yaw_of
 
 Metres = Annotated[float, Meta(ge=-1000, le=1000)]
 
@@ -279,6 +281,34 @@ class HeadingStatus:
     state: HeadingState
 
 
+@dataclass(frozen=True, slots=True)
+class HeadingTrack:
+    """`HeadingStatus` at k epochs between which no fix came."""
+
+    heading: Heading | None
+    innovation: Innovation | None
+    speed: float  # m/s
+    fused_count: int
+    rejected_count: int
+    time_since_fused: Floats  # (k,) s
+    state: NDArray[np.int64]  # (k,) HeadingState
+
+    def at(self, i: int, attitude: AttitudeState) -> HeadingStatus:
+        """The account at one epoch."""
+        return HeadingStatus(
+            attitude.time_us,
+            self.heading,
+            self.innovation,
+            yaw_of(attitude.q_nb),
+            attitude.yaw_std,
+            self.speed,
+            float(self.time_since_fused[i]),
+            self.fused_count,
+            self.rejected_count,
+            HeadingState(int(self.state[i])),
+        )
+
+
 class HeadingMonitor:
     """Keeps the account of GPS heading: what came, what was fused, and for how long not.
 
@@ -298,10 +328,28 @@ class HeadingMonitor:
         self._fused_count = 0
         self._rejected_count = 0
 
-    def advance(self, dt: float) -> None:
-        """Let time pass, seconds."""
-        self._since_fix += dt
-        self._since_fused += dt
+    def advance(self, dt: Floats, aligned: NDArray[np.bool_]) -> HeadingTrack:
+        """Let k epochs pass, each (k,) s since the one before, with yaw known or not.
+
+        Nothing is noted in between: the account of the run differs by the times alone.
+        """
+        since_fix, since_fused = np.cumsum(
+            np.vstack(((self._since_fix, self._since_fused), np.repeat(dt[:, np.newaxis], 2, 1))),
+            axis=0,
+        )[1:].T
+        if len(dt):
+            self._since_fix, self._since_fused = float(since_fix[-1]), float(since_fused[-1])
+        lost = np.where(aligned, HeadingState.DEAD_RECKONING, HeadingState.NO_FIX)
+        state = np.where(since_fix > self._parameters.timeout, lost, self._having_fix(aligned))
+        return HeadingTrack(
+            self._heading,
+            self._innovation,
+            self._motion.speed,
+            self._fused_count,
+            self._rejected_count,
+            since_fused,
+            state,
+        )
 
     def note_motion(self, motion: Motion) -> None:
         """Take note of a usable fix."""
@@ -317,29 +365,13 @@ class HeadingMonitor:
         else:
             self._rejected_count += 1
 
-    def status(self, attitude: AttitudeState) -> HeadingStatus:
-        """Read the account at an epoch."""
-        return HeadingStatus(
-            attitude.time_us,
-            self._heading,
-            self._innovation,
-            attitude.euler[2],
-            attitude.yaw_std,
-            self._motion.speed,
-            self._since_fused,
-            self._fused_count,
-            self._rejected_count,
-            self._state(attitude.aligned),
-        )
-
-    def _state(self, aligned: bool) -> HeadingState:
-        if self._since_fix > self._parameters.timeout:
-            return HeadingState.DEAD_RECKONING if aligned else HeadingState.NO_FIX
+    def _having_fix(self, aligned: NDArray[np.bool_]) -> NDArray[np.int64]:
         if self._motion.heading is None:
-            return HeadingState.TOO_SLOW
-        if not aligned or self._innovation is None or self._innovation.reset:
-            return HeadingState.ALIGNING
-        return HeadingState.FUSING if self._innovation.fused else HeadingState.REJECTING
+            return np.full(aligned.shape, HeadingState.TOO_SLOW)
+        if self._innovation is None or self._innovation.reset:
+            return np.full(aligned.shape, HeadingState.ALIGNING)
+        judged = HeadingState.FUSING if self._innovation.fused else HeadingState.REJECTING
+        return np.where(aligned, judged, HeadingState.ALIGNING)
 
 
 def _known(value: float, otherwise: float) -> float:

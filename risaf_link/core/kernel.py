@@ -40,24 +40,24 @@ class _Risaf:
 
     def __init__(self, parameters: FusionParameters) -> None:
         p = parameters
-        self._kernel = _kernel.Risaf(
+        self.kernel = _kernel.Risaf(
             p.alpha, p.lower_quantile, p.upper_quantile, p.gyro_noise, p.bias_walk
         )
-        self._silence = SilenceMonitor()
+        self.silence = SilenceMonitor()
 
     @property
     def relative_bias(self) -> Floats:
         """Relative bias of each sensor, shape (n, 3), rad/s, as of the last epoch."""
-        return self._kernel.relative_bias().T
+        return self.kernel.relative_bias().T
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch, by their silence alone."""
-        return self._silence.health(self.relative_bias)
+        return self.silence.health(self.relative_bias)
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
-        self._silence.watch(epoch.rates_b, epoch.dt)
-        return _fused(epoch.time_us, self._kernel.fuse(epoch.dt, epoch.rates_b))
+        self.silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
+        return _fused(epoch.time_us, self.kernel.fuse(epoch.dt, epoch.rates_b))
 
 
 class _Robust:
@@ -72,7 +72,7 @@ class _Robust:
         for name, value in structs.asdict(parameters).items():
             if hasattr(told, name):
                 setattr(told, name, value)
-        self._kernel = _kernel.Robust(told)
+        self.kernel = _kernel.Robust(told)
 
     @property
     def relative_bias(self) -> Floats:
@@ -81,11 +81,11 @@ class _Robust:
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch; of a sensor, its worst axis counts."""
-        return robust.judge(self._channels, self._kernel.trusted() > 0.0)
+        return robust.judge(self._channels, self.kernel.trusted() > 0.0)
 
     @property
     def _channels(self) -> robust.Channels:
-        return robust.Channels(**self._kernel.channels())
+        return robust.Channels(**self.kernel.channels())
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
@@ -93,7 +93,7 @@ class _Robust:
 
     def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> FusedRate:
         """Fuse what sensors of one kind read at one instant, (n, 3)."""
-        return _fused(time_us, self._kernel.fuse(dt, readings))
+        return _fused(time_us, self.kernel.fuse(dt, readings))
 
 
 _SOURCES = ("heading", "gravity", "size", "rest")
@@ -220,6 +220,33 @@ class _Aiding:
         return tuple(map(_correction, told))
 
 
+def advance(
+    gyros: Fusion,
+    accelerometers: object,
+    attitude: object,
+    aid: object,
+    dt: Floats,
+    rates_b: Floats,
+    forces_b: Floats,
+) -> Floats | None:
+    """Carry all of them on over k epochs at once; None: not all of them are the kernel's.
+
+    Parameters are those of `Estimator.advance`; the result is the values of a `Track`.
+    """
+    if not (
+        BUILT
+        and isinstance(gyros, _Robust | _Risaf)
+        and isinstance(accelerometers, _Robust)
+        and isinstance(attitude, _Eskf)
+        and isinstance(aid, _Aiding)
+    ):
+        return None
+    if isinstance(gyros, _Risaf):
+        gyros.silence.watch(rates_b, dt)
+    filters = attitude.kernel, aid.kernel
+    return _kernel.advance(gyros.kernel, accelerometers.kernel, *filters, dt, rates_b, forces_b)
+
+
 def _fused(time_us: int, parts: tuple[Floats, NDArray[np.int64], int]) -> FusedRate:
     (rate, variance, noise, bias_walk), active, valid = parts
     return FusedRate(time_us, rate, variance, active, valid, noise, bias_walk)
@@ -233,4 +260,4 @@ if TYPE_CHECKING or not BUILT:
 else:
     Eskf, Aiding, SpeedTracker = _Eskf, _Aiding, _SpeedTracker
 
-__all__ = ["BUILT", "Aiding", "Eskf", "Risaf", "Robust", "SpeedTracker"]
+__all__ = ["BUILT", "Aiding", "Eskf", "Risaf", "Robust", "SpeedTracker", "advance"]

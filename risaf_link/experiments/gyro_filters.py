@@ -3,71 +3,55 @@
 import math
 
 import numpy as np
-from msgspec import structs
 
-from risaf_link.core import kernel
-from risaf_link.core.attitude import AttitudeParameters, PaperFilter
-from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters, Mean
+from risaf_link.core.attitude import AttitudeParameters
+from risaf_link.core.estimator import Estimator
+from risaf_link.core.fusion import Epoch, FusionParameters
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, wrap
-from risaf_link.experiments.method import Aided, ArrayModel, Estimate, Gps, one_rate
+from risaf_link.experiments.method import Aided, ArrayModel, Estimate, Gps, estimate_of, one_rate
 from risaf_link.experiments.so3 import exp
-from risaf_link.pipeline import FORCE_RESOLUTION, NO_FORCE
+
+PAPER = AttitudeParameters(filter="paper")
 
 
-class Ours(Aided):
-    """The service's own: `Robust`, `Eskf`, and `Aiding` by gravity, speed and rest."""
-
-    attitude: kernel.Eskf
-
-    def __init__(self, _: ArrayModel) -> None:
-        parameters, fusion = AttitudeParameters(), FusionParameters()
-        super().__init__(kernel.Eskf(parameters, HeadingParameters()))
-        self.fusion = kernel.Robust(fusion)
-        self._force_fusion = kernel.Robust(structs.replace(fusion, resolution=FORCE_RESOLUTION))
-        self._aiding = kernel.Aiding(parameters)
-
-    def step(self, epoch: Epoch) -> None:
-        """Carry the estimate on to an epoch."""
-        force_b = NO_FORCE
-        if len(epoch.forces_b):
-            forces = epoch.time_us, epoch.dt, epoch.forces_b
-            force_b = self._force_fusion.fuse_readings(*forces).rate_b
-        self.advance(self.fusion.fuse(epoch), epoch.dt, force_b)
-
-    def aid(self, fused: FusedRate, dt: float, force_b: Floats) -> None:
-        """Correct the filter by gravity and rest."""
-        self._aiding.take(self.attitude, fused, force_b, dt)
-
-    def correct(self, gps: Gps) -> None:
-        """Use a fix: its heading, latitude and speed."""
-        gear, motion = self.guard.gear.sign, gps.motion
-        super().correct(gps)
-        self.attitude.set_latitude(gps.latitude)
-        if self.guard.gear.sign != gear:
-            self._aiding.speed.turn_round()
-        if motion.along and motion.is_news and not motion.contradicted:
-            self._aiding.speed.hear(self.guard.ahead(motion), motion.speed_std**2, gps.delay)
-
-
-class Fused(Aided):
-    """A fusion of the service, and the paper's filter of seven states.
+class Service:
+    """A fusion and a filter of the service, with all that it feeds them.
 
     Parameters
     ----------
-    fusion : Fusion
+    fusion : FusionParameters
+    attitude : AttitudeParameters
     """
 
-    def __init__(self, fusion: Fusion) -> None:
-        super().__init__(PaperFilter(AttitudeParameters()))
-        self.fusion = fusion
+    def __init__(self, fusion: FusionParameters, attitude: AttitudeParameters) -> None:
+        self._estimator = Estimator(fusion, attitude, HeadingParameters())
+        self.fusion = self._estimator.fusion
+        self._estimate = Estimate(math.nan, math.pi, 0.0)
 
     def step(self, epoch: Epoch) -> None:
         """Carry the estimate on to an epoch."""
-        self.advance(self.fusion.fuse(epoch), epoch.dt)
+        readings = epoch.rates_b[np.newaxis], epoch.forces_b[np.newaxis]
+        track = self._estimator.advance(np.array([epoch.dt]), *readings)
+        self._estimate = estimate_of(track)
+
+    def correct(self, gps: Gps) -> None:
+        """Use a fix: its heading, speed and latitude."""
+        self._estimator.correct(gps.motion, gps.latitude)
+
+    def estimate(self) -> Estimate:
+        """Say the heading as of the last epoch."""
+        return self._estimate
 
 
-class Risaf(Fused):
+class Ours(Service):
+    """The service as it comes."""
+
+    def __init__(self, _: ArrayModel) -> None:
+        super().__init__(FusionParameters(), AttitudeParameters())
+
+
+class Risaf(Service):
     """The paper's method as printed: eq. 5 to 8, and its filter.
 
     Parameters
@@ -82,21 +66,21 @@ class Risaf(Fused):
         parameters = FusionParameters(
             method="risaf", alpha=alpha, lower_quantile=gate, upper_quantile=1.0 - gate
         )
-        super().__init__(kernel.Risaf(parameters))
+        super().__init__(parameters, PAPER)
 
 
-class RobustFusion(Fused):
+class RobustFusion(Service):
     """Our fusion with the paper's filter: what the fusion alone does."""
 
     def __init__(self, _: ArrayModel) -> None:
-        super().__init__(kernel.Robust(FusionParameters()))
+        super().__init__(FusionParameters(), PAPER)
 
 
-class MeanEkf(Fused):
+class MeanEkf(Service):
     """The paper's baseline, its "Standard EKF": the array's mean, and its filter."""
 
     def __init__(self, _: ArrayModel) -> None:
-        super().__init__(Mean(FusionParameters(method="mean")))
+        super().__init__(FusionParameters(method="mean"), PAPER)
 
 
 class SingleEkf(Aided):
@@ -106,7 +90,7 @@ class SingleEkf(Aided):
     """
 
     def __init__(self, array: ArrayModel) -> None:
-        super().__init__(PaperFilter(AttitudeParameters()))
+        super().__init__()
         self._variance = array.noise**2
 
     def step(self, epoch: Epoch) -> None:
@@ -164,7 +148,7 @@ class Virtual(Aided):
     """
 
     def __init__(self, array: ArrayModel) -> None:
-        super().__init__(PaperFilter(AttitudeParameters()))
+        super().__init__()
         self._noise = array.noise**2
         self._walk = array.bias_walk**2
         self._bias = np.zeros((array.sensors, 3))

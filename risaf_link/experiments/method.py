@@ -5,12 +5,11 @@ A method of one's own is a class in a file, tried with `--method FILE.py`. The c
 fusion is this:
 
     import numpy as np
-    from risaf_link.core.attitude import AttitudeParameters, PaperFilter
     from risaf_link.experiments.method import Aided, one_rate
 
     class Trimmed(Aided):
         def __init__(self, array, cut=10.0):
-            super().__init__(PaperFilter(AttitudeParameters()))
+            super().__init__()
             self.cut, self.variance = int(cut), array.noise**2
 
         def step(self, epoch):
@@ -24,12 +23,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from risaf_link.core.attitude import Innovation, PaperFilter
+from risaf_link.core.attitude import AttitudeParameters, Innovation, PaperFilter
+from risaf_link.core.estimator import NO_FORCE
 from risaf_link.core.fusion import Epoch, FusedRate
-from risaf_link.core.guard import Estimator, HeadingGuard
+from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion
 from risaf_link.core.rotation import Floats
-from risaf_link.pipeline import NO_FORCE
+from risaf_link.core.track import Track
 
 
 class ArrayModel(NamedTuple):
@@ -125,38 +125,39 @@ class HeadingGate:
 
 
 class Aided:
-    """A filter of the service with its headings: all of a method but the fusion, and `step`.
+    """The paper's filter with the service's headings: all of a method but the fusion, and `step`.
 
-    Parameters
+    Attributes
     ----------
-    attitude : Eskf or PaperFilter
+    attitude : PaperFilter
     """
 
-    def __init__(self, attitude: Estimator) -> None:
-        self.attitude = attitude
-        knows = not isinstance(attitude, PaperFilter)
-        self.guard = HeadingGuard(HeadingParameters(), filter_knows=knows)
-        self._state = attitude.state(0)
+    def __init__(self) -> None:
+        self.attitude = PaperFilter(AttitudeParameters())
+        self._guard = HeadingGuard(HeadingParameters(), filter_knows=False)
+        self._estimate = Estimate(math.nan, math.pi, 0.0)
 
-    def advance(self, fused: FusedRate, dt: float, force_b: Floats = NO_FORCE) -> None:
-        """Carry the filter on by a fused rate, over `dt` seconds; specific force in m/s^2."""
+    def advance(self, fused: FusedRate, dt: float) -> None:
+        """Carry the filter on by a fused rate, over `dt` seconds."""
         self.attitude.predict(fused, dt)
-        self.aid(fused, dt, force_b)
-        state = self.attitude.state(fused.time_us)
-        self._state = self.guard.advance(state, force_b, dt)
-
-    def aid(self, fused: FusedRate, dt: float, force_b: Floats) -> None:
-        """Correct the filter by what else is known; by nothing, unless a method says otherwise."""
+        track = Track.of([(fused, self.attitude.state(fused.time_us), NO_FORCE)])
+        self._guard.advance(track, np.array([dt]))
+        self._estimate = estimate_of(track)
 
     def correct(self, gps: Gps) -> None:
         """Use a fix."""
-        self.guard.take(self.attitude, gps.motion)
+        self._guard.take(self.attitude, gps.motion)
 
     def estimate(self) -> Estimate:
         """Say the heading as of the last epoch."""
-        state = self._state
-        yaw = state.euler[2] if state.aligned else math.nan
-        return Estimate(yaw, state.yaw_std, float(state.bias_b[2]))
+        return self._estimate
+
+
+def estimate_of(track: Track) -> Estimate:
+    """What the last epoch of a track comes to."""
+    state = track.attitude(-1, 0)
+    yaw = state.euler[2] if state.aligned else math.nan
+    return Estimate(yaw, state.yaw_std, float(state.bias_b[2]))
 
 
 def one_rate(epoch: Epoch, rate_b: Floats, variance: float, sensors: int) -> FusedRate:

@@ -1,0 +1,116 @@
+"""Readings -> attitude: what is done at every epoch, for a run of epochs at once.
+
+    readings -> FusedRate -> predict -> gravity and rest
+
+Where there is a kernel it does the run; what it does is `Estimator.advance`. What GPS says comes
+in between two runs.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from msgspec import structs
+
+from risaf_link.core import kernel
+from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation, PaperFilter
+from risaf_link.core.fusion import (
+    Epoch,
+    FusedRate,
+    Fusion,
+    FusionParameters,
+    Mean,
+    Median,
+)
+from risaf_link.core.guard import HeadingGuard
+from risaf_link.core.heading import HeadingParameters, Motion
+from risaf_link.core.rotation import Floats
+from risaf_link.core.track import Track
+
+FUSIONS: dict[str, Callable[[FusionParameters], Fusion]] = {
+    "robust": kernel.Robust,
+    "risaf": kernel.Risaf,
+    "median": Median,
+    "mean": Mean,
+}
+FORCE_RESOLUTION = 0.02  # m/s^2; no accelerometer is blamed for less
+NO_FORCE = np.full(3, np.nan)
+
+
+class Estimator:
+    """A fusion, a filter, what aids it at every epoch, and what stands guard over its headings.
+
+    Parameters
+    ----------
+    fusion : FusionParameters
+    attitude : AttitudeParameters
+    heading : HeadingParameters
+
+    Attributes
+    ----------
+    fusion : Fusion
+    """
+
+    def __init__(
+        self, fusion: FusionParameters, attitude: AttitudeParameters, heading: HeadingParameters
+    ) -> None:
+        self.fusion = FUSIONS[fusion.method](fusion)
+        self._force_fusion = kernel.Robust(structs.replace(fusion, resolution=FORCE_RESOLUTION))
+        self._delay = heading.delay
+        self._filter: kernel.Eskf | PaperFilter
+        if attitude.filter == "eskf":
+            self._filter = kernel.Eskf(attitude, heading)
+        else:
+            self._filter = PaperFilter(attitude)
+        self._aiding = kernel.Aiding(attitude)  # of the Eskf
+        self._guard = HeadingGuard(heading, not isinstance(self._filter, PaperFilter))
+
+    def advance(self, dt: Floats, rates_b: Floats, forces_b: Floats) -> Track:
+        """Carry the estimate on over k epochs.
+
+        Parameters
+        ----------
+        dt : ndarray, shape (k,)
+            Seconds, each since the epoch before.
+        rates_b, forces_b : ndarray, shapes (k, n, 3) and (k, m, 3)
+            rad/s and m/s^2; NaN where not valid. m may be 0.
+        """
+        parts = self.fusion, self._force_fusion, self._filter, self._aiding
+        values = kernel.advance(*parts, dt, rates_b, forces_b)
+        if values is None:
+            steps = zip(dt.tolist(), rates_b, forces_b, strict=True)
+            track = Track.of([self._step(Epoch(0, *step, 0)) for step in steps])
+        else:
+            track = Track(values)
+        self._guard.advance(track, dt)
+        return track
+
+    def _step(self, epoch: Epoch) -> tuple[FusedRate, AttitudeState, Floats]:
+        """One epoch; this is what the kernel does as well."""
+        fused = self.fusion.fuse(epoch)
+        self._filter.predict(fused, epoch.dt)
+        force_b = NO_FORCE
+        if len(epoch.forces_b):
+            force_b = self._force_fusion.fuse_readings(0, epoch.dt, epoch.forces_b).rate_b
+        if not isinstance(self._filter, PaperFilter):
+            self._aiding.take(self._filter, fused, force_b, epoch.dt)
+        return fused, self._filter.state(0), force_b
+
+    def correct(self, motion: Motion, latitude: float) -> Innovation | None:
+        """Use what a fix says; None: it says nothing of heading.
+
+        Parameters
+        ----------
+        motion : Motion
+        latitude : float
+            rad.
+        """
+        gear = self._guard.gear.sign
+        innovation = self._guard.take(self._filter, motion)
+        if not isinstance(self._filter, PaperFilter):
+            self._filter.set_latitude(latitude)
+            if self._guard.gear.sign != gear:
+                self._aiding.speed.turn_round()
+            if motion.along and motion.is_news and not motion.contradicted:
+                ahead = self._guard.ahead(motion)
+                self._aiding.speed.hear(ahead, motion.speed_std**2, self._delay)
+        return innovation

@@ -1,0 +1,90 @@
+"""What is estimated at each of a run of epochs, as columns."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from risaf_link.core.attitude import AttitudeState
+from risaf_link.core.fusion import FusedRate
+from risaf_link.core.rotation import Floats
+
+Q_NB, RATE, BIAS, STD = slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13)
+ALIGNED, RESETS = 13, 14
+FUSED, VARIANCE, NOISE, WALK = slice(15, 18), slice(18, 21), slice(21, 24), slice(24, 27)
+ACTIVE, VALID, FORCE = slice(27, 30), 30, slice(31, 34)
+COLUMNS = 34
+YAW_STD = 12
+
+
+class Track:
+    """Fused rates, attitudes and specific forces of k epochs, one after another.
+
+    Parameters
+    ----------
+    values : ndarray, shape (k, 34)
+        The columns that this module names; units are those of `FusedRate` and `AttitudeState`.
+    """
+
+    def __init__(self, values: Floats) -> None:
+        self.values = values
+
+    @classmethod
+    def of(cls, epochs: Iterable[tuple[FusedRate, AttitudeState, Floats]]) -> "Track":
+        """Put together what single epochs came to."""
+        rows = [
+            np.concatenate(
+                (
+                    *(state.q_nb, state.rate_b, state.bias_b),
+                    (state.roll_std, state.pitch_std, state.yaw_std, state.aligned, state.resets),
+                    *(fused.rate_b, fused.variance, fused.noise, fused.bias_walk, fused.active),
+                    *((fused.valid,), force_b),
+                )
+            )
+            for fused, state, force_b in epochs
+        ]
+        return cls(np.array(rows).reshape(-1, COLUMNS))
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def q_nb(self) -> Floats:
+        """Attitude, (k, 4)."""
+        return self.values[:, Q_NB]
+
+    @property
+    def rate_b(self) -> Floats:
+        """Rate, bias taken off, (k, 3), rad/s."""
+        return self.values[:, RATE]
+
+    @property
+    def force_b(self) -> Floats:
+        """Fused specific force, (k, 3), m/s^2; NaN: there is no accelerometer."""
+        return self.values[:, FORCE]
+
+    @property
+    def yaw_std(self) -> Floats:
+        """Standard deviation of yaw, (k,), rad."""
+        return self.values[:, YAW_STD]
+
+    @property
+    def aligned(self) -> NDArray[np.bool_]:
+        """Whether yaw has been set by a heading, (k,)."""
+        return self.values[:, ALIGNED] > 0.0
+
+    def fused(self, i: int, time_us: int) -> FusedRate:
+        """The fused rate of one epoch."""
+        row = self.values[i]
+        active = row[ACTIVE].astype(np.int64)
+        return FusedRate(
+            time_us, row[FUSED], row[VARIANCE], active, int(row[VALID]), row[NOISE], row[WALK]
+        )
+
+    def attitude(self, i: int, time_us: int) -> AttitudeState:
+        """The attitude at one epoch."""
+        row = self.values[i]
+        roll, pitch, yaw, aligned, resets = row[STD.start : RESETS + 1].tolist()
+        return AttitudeState(
+            time_us, row[Q_NB], row[RATE], row[BIAS], roll, pitch, yaw, aligned > 0.0, int(resets)
+        )
