@@ -10,6 +10,7 @@ from streams import chunks, raws, read_by_pymavlink, recording, seeded, sequence
 
 from risaf_link.mavlink.tlog import RECEIVED, SENT, TlogReader, record
 
+pytestmark = pytest.mark.usefixtures("cutter")
 START_US = 1_700_000_000_000_000
 STEP_US = 10_000
 FRAMES = sequence("both", 51, 40)
