@@ -7,6 +7,7 @@ import pytest
 from hypothesis import settings
 
 from risaf_link.core import kernel
+from risaf_link.mavlink import frame, search
 
 settings.register_profile(
     "risaf",
@@ -29,3 +30,14 @@ def filter_form(request):
                 if hasattr(module, numpy_form.__name__):
                     patch.setattr(module, numpy_form.__name__, form)
         yield request.param
+
+
+@pytest.fixture(params=["python", "kernel"], scope="module")
+def cutter(request):
+    """Frames are cut by either form."""
+    if request.param == "kernel" and frame.cut is search.cut:
+        pytest.skip("no kernel was built: that takes a C++ compiler")
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "python":
+            patch.setattr(frame, "cut", search.cut)
+        yield

@@ -29,6 +29,7 @@ from streams import (
 )
 
 from risaf_link.mavlink import frame as frame_module
+from risaf_link.mavlink import search
 from risaf_link.mavlink.dialect import CRC_EXTRA, IDS
 from risaf_link.mavlink.frame import FrameParser, encode
 
@@ -37,6 +38,7 @@ UNKNOWN = 70_000
 LARGEST = 10 + 255 + 2 + 13  # bytes of a frame
 MOST_HELD = 13 + 8 + LARGEST + 8  # bytes: a signature before it, a prefix on either side
 SEEDS = [3, 4, 5]  # without an accident: a checksum fits by chance once in 65,536 times
+pytestmark = pytest.mark.usefixtures("cutter")
 KNOWN_MIXES = ["arrays", "MAVLink 2", "MAVLink 1", "both", "signed"]
 
 
@@ -249,6 +251,41 @@ def test_the_parser_never_holds_more_than_a_frame_and_what_is_around_it(parts, p
             assert len(parser._buffer) < MOST_HELD
 
 
+@settings(max_examples=200)
+@given(
+    pieces(),
+    st.sampled_from([0, 8]),
+    st.lists(st.integers(0, 400), max_size=12),
+    st.randoms(use_true_random=False),
+)
+def test_both_forms_find_the_same_in_every_piece(parts, prefix_size, sizes, random):
+    stream = b"".join(random.randbytes(random.choice((0, prefix_size))) + part for part in parts)
+    for cut in (chunks(stream, sizes), chunks(stream, [1] * len(stream))):
+        buffer, done, in_step = b"", 0, True
+        *early, last = cut
+        for piece, ended in [*((piece, False) for piece in early), (last, True)]:
+            buffer += piece
+            found = frame_module.cut(buffer, prefix_size, done, in_step, ended)
+            assert found == search.cut(buffer, prefix_size, done, in_step, ended)
+            _, keep, done, in_step, _, _ = found
+            buffer = buffer[keep:]
+
+
+@settings(max_examples=50)
+@given(pieces(), st.sampled_from([0, 8]), st.lists(st.integers(0, 400), max_size=12))
+def test_tables_hold_the_frames_that_are_returned_one_by_one(parts, prefix_size, sizes):
+    stream = b"".join(parts)
+    frames, parser = parsed(chunks(stream, sizes), prefix_size)
+    other = FrameParser(prefix_size)
+    tables = [*map(other.receive_table, chunks(stream, sizes)), other.end_table()]
+    assert [table.frame(row) for table in tables for row in range(len(table))] == frames
+    assert (other.dropped, other.skipped) == (parser.dropped, parser.skipped)
+    for table in tables:
+        for row, start in enumerate(table.payloads):
+            payload = table.buffer[start : start + table.cuts["size"][row]]
+            assert payload == table.frame(row).payload
+
+
 @pytest.mark.parametrize("mix", KNOWN_MIXES)
 def test_a_frame_comes_with_its_last_byte(mix):
     parser = FrameParser()
@@ -272,18 +309,25 @@ def test_a_frame_comes_with_its_last_byte(mix):
     ],
 )
 def test_a_stream_of_marks_costs_at_most_one_frames_checksum_a_byte(pattern, size, monkeypatch):
-    summed = 0
-    checksum = frame_module.mcrf4xx
-
-    def counting(content):
-        nonlocal summed
-        summed += len(content)
-        return checksum(content)
-
-    monkeypatch.setattr(frame_module, "mcrf4xx", counting)
     stream = (pattern * 20_000)[:20_000]
-    parsed(chunks(stream, [size] * (len(stream) // size)))
-    assert summed <= LARGEST * len(stream)
+    pieces = list(chunks(stream, [size] * (len(stream) // size)))
+    assert summed(pieces, monkeypatch) <= LARGEST * len(stream)
+
+
+def summed(pieces, monkeypatch):
+    """How many bytes go through a checksum while a stream is cut."""
+    if frame_module.cut is not search.cut:
+        kernel = frame_module._kernel.Cutter(CRC_EXTRA)
+        monkeypatch.setattr(frame_module, "cut", kernel.cut)
+        parsed(pieces)
+        return kernel.summed
+    sizes = []
+    checksum = search.mcrf4xx
+    monkeypatch.setattr(
+        search, "mcrf4xx", lambda content: sizes.append(len(content)) or checksum(content)
+    )
+    parsed(pieces)
+    return sum(sizes)
 
 
 # What is inside a frame
@@ -316,7 +360,7 @@ def test_a_frame_in_a_payload_is_payload():
 def test_compatibility_flags_do_not_matter():
     flagged = bytearray(heartbeat())
     flagged[3] = 0x80
-    flagged[-2:] = frame_module.checksum_of(bytes(flagged[1:-2]), CRC_EXTRA[HEARTBEAT])
+    flagged[-2:] = search.checksum_of(bytes(flagged[1:-2]), CRC_EXTRA[HEARTBEAT])
     assert raws(bytes(flagged)) == [bytes(flagged)]
 
 
@@ -392,7 +436,7 @@ def test_a_frame_that_only_starts_in_an_unknown_message_does_not_speak_against_i
     unknown_frame = framed(UNKNOWN, start, 5)
     head = b"\xfd\x0c\0\0\1\7\x09" + HEARTBEAT.to_bytes(3, "little")
     crossing = start + unknown_frame[-2:] + head + b"12345678"
-    checksum = frame_module.checksum_of(crossing[1:], CRC_EXTRA[HEARTBEAT])
+    checksum = search.checksum_of(crossing[1:], CRC_EXTRA[HEARTBEAT])
     follower = heartbeat(b"12345678" + checksum + b"90")
     assert raws(crossing + checksum) == [crossing + checksum]
     for pieces in ([unknown_frame + follower], chunks(unknown_frame + follower, [1] * 60)):

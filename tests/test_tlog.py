@@ -1,6 +1,7 @@
 """Telemetry logs, read by pymavlink and by us, and logs that cannot be trusted."""
 
 import struct
+import tracemalloc
 from itertools import count, islice
 
 import pytest
@@ -8,8 +9,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from streams import chunks, raws, read_by_pymavlink, recording, seeded, sequence
 
+from risaf_link.mavlink.frame import FrameParser
 from risaf_link.mavlink.tlog import RECEIVED, SENT, TlogReader, record
 
+pytestmark = pytest.mark.usefixtures("cutter")
 START_US = 1_700_000_000_000_000
 STEP_US = 10_000
 FRAMES = sequence("both", 51, 40)
@@ -213,8 +216,53 @@ def test_a_record_without_a_stamp_has_the_time_before(places):
     assert (times, frames, replaced) == (expected, list(FRAMES), len(places))
 
 
+spans = st.one_of(
+    st.tuples(st.just("steps"), st.integers(1, 30), st.sampled_from([0, 4, STEP_US, 400_000_000])),
+    st.tuples(st.just("missing"), st.integers(1, 12), st.just(0)),
+    st.tuples(st.just("wild"), st.integers(1, 3), st.sampled_from(WILD)),
+    st.tuples(st.just("set"), st.just(1), st.integers(-(10**9), 10**9).map(lambda us: us * 4)),
+)
+
+
+@given(st.lists(spans, max_size=12), st.lists(st.integers(0, 900), max_size=12))
+def test_times_in_tables_are_those_of_the_rule_for_one_record(parts, sizes):
+    stamps, now_us = [], START_US
+    for kind, length, value in parts:
+        now_us += value if kind == "set" else 0
+        for _ in range(length):
+            now_us += value if kind == "steps" else 0
+            stamps.append({"missing": None, "wild": value}.get(kind, now_us))
+    frames = [FRAMES[i % 40] for i in range(len(stamps))]
+    log = b"".join(
+        (b"" if stamp is None else struct.pack(">Q", stamp)) + frame
+        for stamp, frame in zip(stamps, frames, strict=True)
+    )
+    rule, expected, last = TlogReader([]), [], None
+    for i, stamp in enumerate(stamps):
+        last = rule._time(stamp, [s for s in stamps[i + 1 : i + 9] if s is not None], last)
+        expected.append(last)
+    reader = TlogReader([])
+    reader.parser, reader._chunks = FrameParser(8), chunks(log, sizes)
+    tables = list(reader.tables())
+    assert [time_us for _, times_us in tables for time_us in times_us.tolist()] == expected
+    assert [t.frame(row).raw for t, _ in tables for row in range(len(t))] == frames
+    assert reader.stamps_replaced == rule.stamps_replaced
+
+
 def test_frames_of_a_log_are_the_parsers():
     log = log_of(TIMES)
     reader = TlogReader([log])
     assert [entry.frame.raw for entry in reader] == raws(b"".join(FRAMES))
     assert (reader.parser.dropped, reader.parser.skipped) == ({}, 0)
+
+
+def test_a_log_is_read_in_constant_memory():
+    piece = b"".join(record(START_US + i * STEP_US, FRAMES[i % 40]) for i in range(1000))
+    peaks = []
+    for length in (20, 200):
+        reader = TlogReader(bytes(bytearray(piece)) for _ in range(length))
+        tracemalloc.start()
+        assert sum(len(table) for table, _ in reader.tables()) == 1000 * length
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0] < 20 * len(piece)

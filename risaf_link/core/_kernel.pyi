@@ -104,3 +104,35 @@ def advance(
     rates_b: Floats,
     forces_b: Floats,
 ) -> Floats: ...
+
+class Cutter:
+    summed: int
+    def __init__(self, extras: dict[int, int]) -> None: ...
+    def cut(
+        self, buffer: bytes, prefix_size: int, done: int, in_step: bool, ended: bool
+    ) -> tuple[bytes, int, int, bool, int, tuple[int, ...]]: ...
+
+class Sensors:
+    def __init__(self, count: int, scale: float, limit: float) -> None: ...
+
+class ArrayLayout:
+    def __init__(
+        self, system: int, component: int, array_id: int, gyros: Sensors, accels: Sensors
+    ) -> None: ...
+
+class EpochFinder:
+    def __init__(self, kinds: list[int]) -> None: ...
+    def load(
+        self, buffer: bytes, cuts: NDArray[np.uint8], times_us: NDArray[np.uint64]
+    ) -> None: ...
+    def take(
+        self, array: ArrayLayout, time_us: int, sequence: int, most: int
+    ) -> (
+        tuple[
+            tuple[NDArray[np.int64], Floats, Floats, Floats, NDArray[np.int64], NDArray[np.int64]],
+            tuple[int, int, int, int],
+            tuple[int, int],
+        ]
+        | None
+    ): ...
+    def single(self) -> int: ...

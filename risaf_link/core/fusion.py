@@ -70,21 +70,24 @@ class EpochBlock:
     """k epochs, one after another, of an array that stays as it is."""
 
     time_us: NDArray[np.int64]  # (k,)
-    received_us: NDArray[np.int64]  # (k,) when what made each of them whole came
     dt: Floats  # (k,) seconds, each since the epoch before
     rates_b: Floats  # (k, n, 3) rad/s; NaN: no valid reading
     forces_b: Floats  # (k, m, 3) m/s^2; m may be 0
+    received_us: NDArray[np.int64]  # (k,) when the frame came that made each of them whole
 
     @classmethod
     def of(cls, epoch: Epoch, received_us: int) -> "EpochBlock":
         """One epoch alone."""
         return cls(
             np.array([epoch.time_us]),
-            np.array([received_us]),
             np.array([epoch.dt]),
             epoch.rates_b[np.newaxis],
             epoch.forces_b[np.newaxis],
+            np.array([received_us]),
         )
+
+    def __len__(self) -> int:
+        return len(self.time_us)
 
 
 @dataclass(frozen=True, slots=True)

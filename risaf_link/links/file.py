@@ -5,7 +5,7 @@ from pathlib import Path
 
 from risaf_link.errors import LogError
 
-CHUNK = 1 << 16  # bytes
+CHUNK = 1 << 20  # bytes; with less, or more, a log takes longer
 
 
 def read(path: Path, progress: Callable[[int], None] = lambda _: None) -> Iterator[bytes]:

@@ -33,8 +33,12 @@ class Choice:
             if self.chosen is not None and not is_silent and rank >= self._rank:
                 return False
             self.chosen, self._rank = source, rank
-        self._heard_us = now_us
+        self.hear(now_us)
         return True
+
+    def hear(self, now_us: int) -> None:
+        """Take note that the chosen source has been heard."""
+        self._heard_us = now_us
 
 
 class _Stream:

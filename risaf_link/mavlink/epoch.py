@@ -19,12 +19,15 @@ What the gyros read at one instant is an epoch. The rules:
 """
 
 from collections import Counter, deque
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
-from risaf_link.core.fusion import Epoch
+from risaf_link.core.fusion import Epoch, EpochBlock
 from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.roster import Roster, fitted
 
@@ -36,6 +39,7 @@ REVIEW = 128  # epochs, after which it is reviewed whom an epoch waits for
 SHRINK_AFTER = 8 * REVIEW
 JUMP_US = 1_000_000  # more is far off
 BELIEVED = 4  # chunks far off in a row
+STEPS = 15  # from epoch to epoch; their median is the period
 
 
 class ArrayParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -83,6 +87,15 @@ class GyroChunk(Struct, frozen=True):  # like Frame: there are hundreds a second
         return len(self.rates_s) + len(self.forces_s)
 
 
+@dataclass(frozen=True, slots=True)
+class RegularEpochs(EpochBlock):
+    """Epochs in a row, each of which is whole and follows directly on the one before."""
+
+    row: NDArray[np.int64]  # (k,) of the frame that made each whole, in its table
+    newest: GyroChunk  # the first of the last epoch; of these two, readings do not matter any more
+    begun: GyroChunk  # the first of the last epoch's gyros
+
+
 class EpochAssembler:
     """Puts the chunks of one array together.
 
@@ -107,7 +120,7 @@ class EpochAssembler:
         self._last: GyroChunk | None = None  # began the last epoch, by the present clock
         self._last_received_us: int | None = None  # likewise, by any clock
         self._last_size = 0
-        self._steps_us: deque[int] = deque(maxlen=15)
+        self._steps_us: deque[int] = deque(maxlen=STEPS)
         self._period_us = 0
 
     @property
@@ -142,6 +155,64 @@ class EpochAssembler:
         epochs = [self._close(time_us) for time_us in sorted(self._gyros.open)]
         self._drop_forces(leave=0)
         return epochs
+
+    # Whole epochs at once
+
+    def is_steady(self, told: int) -> bool:
+        """Whether whole epochs that follow may be taken at once.
+
+        That is so when nothing waits, when the size of the array is as before, and when an epoch
+        that is whole has come from every sensor.
+
+        Parameters
+        ----------
+        told : int
+            How many gyros the array says it has; 0: it does not say.
+        """
+        last, newest = self._last, self._newest
+        return (
+            last is not None
+            and newest is not None
+            and newest.time_us == last.time_us
+            and last.sequence is not None
+            and not (self._begun_by or self._gyros.open or self._accels.open or self._astray)
+            and 0 < self._last_size == self._gyros.size
+            and (told in {0, self._gyros.told} or self._parameters.sensors > 0)
+            and self._gyros.awaits_all
+            and self._accels.awaits_all
+        )
+
+    @property
+    def last(self) -> GyroChunk | None:
+        """What began the last epoch, by the present clock."""
+        return self._last
+
+    @property
+    def forces(self) -> int:
+        """How many accelerometers the array has, as far as is known."""
+        return self._accels.size
+
+    @property
+    def until_review(self) -> int:
+        """How many epochs may be taken at once, at most."""
+        return REVIEW - self.counts["epochs"] % REVIEW
+
+    def take_block(self, block: RegularEpochs) -> None:
+        """Take epochs as `add` would take their chunks; they are steady, and all sensors are in.
+
+        The chunks of an epoch came together, those of either kind in the order of the sensors. The
+        time goes on from `last` by no more than JUMP_US an epoch, and the sequence number by one.
+        """
+        if self._last is None or len(block) > self.until_review:
+            raise ValueError("block: must follow on an epoch and end with the next review")
+        times_us = block.time_us.tolist()
+        for roster in (self._gyros, self._accels):
+            roster.close_whole(times_us)
+        self.counts["epochs"] += len(block)
+        recent_us = [self._last.time_us, *times_us][-STEPS - 1 :]
+        self._steps_us.extend(later - earlier for earlier, later in pairwise(recent_us))
+        self._newest = block.newest
+        self._close_steps(block.begun)
 
     # Sources and clocks
 
@@ -207,7 +278,7 @@ class EpochAssembler:
     def _take_rates(self, time_us: int, chunk: GyroChunk) -> None:
         first, count = chunk.first_sensor, len(chunk.rates_s)
         self._gyros.see(first + count)
-        gone = self._gyros.gone.get(time_us)
+        gone = self._gyros.recall(time_us)
         if gone is not None:
             came = gone.mark(first, count)
             self._gyros.attend(first, came)
@@ -225,7 +296,7 @@ class EpochAssembler:
     def _take_forces(self, time_us: int, chunk: GyroChunk) -> None:
         first, count = chunk.first_sensor, len(chunk.forces_s)
         self._accels.see(first + count)
-        gone = self._accels.gone.get(time_us)
+        gone = self._accels.recall(time_us)
         if gone and gone.includes(first, count):
             self.counts["duplicate"] += count
             return
@@ -321,6 +392,10 @@ class EpochAssembler:
     def _end_epoch(self, begun: GyroChunk) -> None:
         if self._last is not None:
             self._steps_us.append(begun.time_us - self._last.time_us)
+        self._close_steps(begun)
+
+    def _close_steps(self, begun: GyroChunk) -> None:
+        if self._steps_us:
             self._period_us = sorted(self._steps_us)[len(self._steps_us) // 2]
         self._last, self._last_received_us = begun, begun.received_us
         if self.counts["epochs"] % REVIEW == 0:

@@ -71,6 +71,13 @@ class ArrayInfo:
     accel_range: float  # m/s^2; inf: not known
     sensors: int  # 0: not known
 
+    def count_of(self, is_gyro: bool) -> tuple[float, float]:
+        """Scale of a count, NaN: not known; and from which magnitude on a reading is saturated."""
+        scale, limit = (
+            (self.gyro_scale, self.gyro_range) if is_gyro else (self.accel_scale, self.accel_range)
+        )
+        return scale, min(limit * (1 - 1e-6), INT16_LIMIT * scale)
+
 
 class Ingest:
     """Reads what the estimator needs from frames.
@@ -143,6 +150,34 @@ class Ingest:
         """What an array has said of itself."""
         return self._infos.get((source.system, source.component, source.array_id))
 
+    def info_of_counts(self, source: Source) -> ArrayInfo:
+        """What the counts of an array mean, by what it says or, else, by the configuration."""
+        return self.info(source) or self._assumed_info()
+
+    @property
+    def message_ids(self) -> frozenset[int]:
+        """Of the messages that are read."""
+        return frozenset(self._readers)
+
+    @property
+    def source(self) -> Source | None:
+        """The array that is listened to."""
+        return cast("Source | None", self._arrays.chosen)
+
+    def take_block(self, heard_us: int, invalid: int, saturated: int) -> None:
+        """Take note of frames of this array that were read elsewhere.
+
+        Parameters
+        ----------
+        heard_us : int
+            When the last one with gyros came.
+        invalid, saturated : int
+            Readings of one axis, as in `counts`.
+        """
+        self._arrays.hear(heard_us)
+        self.counts["invalid"] += invalid
+        self.counts["saturated"] += saturated
+
     def _admits(self, source: Source, time_us: int, received_us: int, has_gyros: bool) -> bool:
         """Whether samples are of the array that is listened to; gyros decide which one that is."""
         if time_us > LATEST_US:
@@ -202,10 +237,8 @@ class Ingest:
             self.counts["malformed"] += 1
             return None
         source = Source(frame.system, frame.component, "GYRO_ARRAY", array_id)
-        info = self.info(source) or self._assumed_info()
-        scale, limit = (
-            (info.gyro_scale, info.gyro_range) if is_gyro else (info.accel_scale, info.accel_range)
-        )
+        info = self.info_of_counts(source)
+        scale, limit = info.count_of(is_gyro)
         if not scale > 0:
             self.counts["unscaled"] += 1
             return None
@@ -213,7 +246,6 @@ class Ingest:
             return None
         counts = np.frombuffer(payload, "<i2", 3 * count, ARRAY_HEAD.size).reshape(count, 3)
         values = counts * scale
-        limit = min(limit * (1 - 1e-6), INT16_LIMIT * scale)
         if np.abs(values).max() >= limit:
             values[counts == INVALID] = np.nan
             values = self._clean(values, limit)

@@ -1,6 +1,7 @@
 """The sensors of one kind in an array: which of them take part, and which samples have come."""
 
 from dataclasses import dataclass
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -72,12 +73,13 @@ class Roster:
     expected : int
         How many belong to a complete epoch: who is awaited, and all that are told of.
     open, gone : dict of int to Instant
-        Samples, by the time at which they were read: what waits, and what was handed on of late.
+        Samples, by the time at which they were read: what waits, and what was handed on of late;
+        there, a number stands for an instant at which all of so many sensors came.
     """
 
     def __init__(self, told: int = 0) -> None:
         self.open: dict[int, Instant] = {}
-        self.gone: dict[int, Instant] = {}
+        self.gone: dict[int, Instant | int] = {}
         self.attended = np.zeros(told, dtype=np.int64)
         self.told = told
         self._seen = 0  # the last sensor that came of late, plus one
@@ -87,6 +89,11 @@ class Roster:
     def size(self) -> int:
         """How many sensors there are."""
         return len(self.awaited)
+
+    @property
+    def awaits_all(self) -> bool:
+        """Whether all sensors are awaited."""
+        return self._quorum == self.size
 
     def tell(self, size: int) -> None:
         """Believe the array that it has so many; 0: it does not say."""
@@ -112,6 +119,24 @@ class Roster:
         instant = self.gone[time_us] = self.open.pop(time_us)
         if len(self.gone) > REMEMBERED:
             del self.gone[next(iter(self.gone))]
+        return instant
+
+    def close_whole(self, times_us: list[int]) -> None:
+        """Hand on instants at which all sensors came, as `see`, `put`, `attend` and `close` do."""
+        if not self.size:
+            return
+        self.see(self.size)
+        self.attended += len(times_us)
+        self.gone.update(dict.fromkeys(times_us[-REMEMBERED:], self.size))
+        for time_us in list(islice(self.gone, max(0, len(self.gone) - REMEMBERED))):
+            del self.gone[time_us]
+
+    def recall(self, time_us: int) -> Instant | None:
+        """What was handed on of late that had been read at a time."""
+        instant = self.gone.get(time_us)
+        if isinstance(instant, int):
+            whole = np.ones(instant, dtype=bool)
+            instant = self.gone[time_us] = Instant(np.full((instant, 3), np.nan), whole, instant)
         return instant
 
     def is_whole(self, time_us: int) -> bool:

@@ -9,11 +9,13 @@ frames. A stamp is believed if those that follow bear it out, and else replaced 
 """
 
 import struct
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from risaf_link.mavlink.frame import Frame, FrameParser
+import numpy as np
+from numpy.typing import NDArray
+
+from risaf_link.mavlink.frame import Frame, FrameParser, FrameTable
 
 STAMP = struct.Struct(">Q")
 RECEIVED, SENT = 0, 3
@@ -21,6 +23,9 @@ RECEIVED, SENT = 0, 3
 LEAP_US = 600_000_000  # a log is hardly ever silent for so long
 LOOKAHEAD = 8  # records
 SAMPLE = 16384  # bytes that tell a log with stamps from one without
+
+Stamps = NDArray[np.uint64]
+Mask = NDArray[np.bool_]
 
 
 class Record(NamedTuple):
@@ -72,29 +77,73 @@ class TlogReader:
         self.stamps_replaced = 0
 
     def __iter__(self) -> Iterator[Record]:
+        for table, times_us in self.tables():
+            for row, time_us in enumerate(times_us.tolist()):
+                yield Record(time_us, table.frame(row))
+
+    def tables(self) -> Iterator[tuple[FrameTable, Stamps]]:
+        """Read the log in pieces as long as its chunks.
+
+        Yields
+        ------
+        table : FrameTable
+            The next frames, at least one.
+        times_us : ndarray of uint64
+            The time of each, as in Record.
+        """
         last: int | None = None
-        ahead: deque[Frame] = deque()
-        stamps: deque[int | None] = deque()
-        for frame in self._frames():
-            ahead.append(frame)
-            stamps.append(_stamp(frame))
-            if len(ahead) > LOOKAHEAD:
-                last = self._time(stamps, last)
-                yield Record(last, ahead.popleft())
-        while ahead:
-            last = self._time(stamps, last)
-            yield Record(last, ahead.popleft())
+        waiting: list[tuple[FrameTable, Stamps, Mask]] = []
+        for table, is_last in self._tables():
+            if len(table):
+                waiting.append((table, *_stamps(table)))
+            while waiting and (is_last or sum(len(t) for t, *_ in waiting[1:]) >= LOOKAHEAD):
+                first, *_ = waiting[0]
+                end = len(first) + LOOKAHEAD
+                stamps = np.concatenate([each for _, each, _ in waiting])[:end]
+                stamped = np.concatenate([each for _, _, each in waiting])[:end]
+                times_us = self._times(stamps, stamped, len(first), last)
+                last = int(times_us[-1])
+                del waiting[0]
+                yield first, times_us
 
-    def _frames(self) -> Iterator[Frame]:
-        yield from self.parser.receive_data(self._start)
+    def _tables(self) -> Iterator[tuple[FrameTable, bool]]:
+        """Frames of every chunk, and whether they are the last."""
+        yield self.parser.receive_table(self._start), False
         for chunk in self._chunks:
-            yield from self.parser.receive_data(chunk)
-        yield from self.parser.end()
+            yield self.parser.receive_table(chunk), False
+        yield self.parser.end_table(), True
 
-    def _time(self, stamps: deque[int | None], last: int | None) -> int:
-        """Take the first stamp; the time of its record, given the one before."""
-        stamp = stamps.popleft()
-        following = [s for s in stamps if s is not None]
+    def _times(self, stamps: Stamps, stamped: Mask, count: int, last: int | None) -> Stamps:
+        """Times of the first `count` records, given the one before; further stamps may follow.
+
+        Where stamps are missing, or are none that `_is_believable` would doubt, a whole run of
+        them is taken at once.
+        """
+        times_us = np.empty(count, np.uint64)
+        rising = stamped[1:] & stamped[:-1] & (stamps[1:] >= stamps[:-1])
+        borne_out = np.append(rising, True)  # by the next one
+        usual = np.append(False, rising & (stamps[1:] - stamps[:-1] <= LEAP_US)) & borne_out
+        missing = ~stamped
+        at = 0
+        while at < count:
+            end, stamp = at + 1, int(stamps[at])
+            if last is not None and missing[at]:
+                end = _run(missing[:count], end)
+                times_us[at:end] = last
+                self.stamps_replaced += end - at
+            elif last is not None and last <= stamp <= last + LEAP_US and borne_out[at]:
+                end = _run(usual[:count], end)
+                times_us[at:end] = stamps[at:end]
+            else:
+                following = slice(end, end + LOOKAHEAD)
+                borne_by = stamps[following][stamped[following]].tolist()
+                times_us[at] = self._time(stamp if stamped[at] else None, borne_by, last)
+            last = int(times_us[end - 1])
+            at = end
+        return times_us
+
+    def _time(self, stamp: int | None, following: Sequence[int], last: int | None) -> int:
+        """Time of a record, given its stamp, the next ones and the time before."""
         if stamp is not None and _is_believable(stamp, last, following):
             return stamp
         self.stamps_replaced += 1
@@ -116,15 +165,26 @@ def _is_believable(stamp: int, last: int | None, following: Sequence[int]) -> bo
     return not following or not last <= following[0] < stamp
 
 
-def _stamp(frame: Frame) -> int | None:
-    if len(frame.prefix) < STAMP.size:
-        return None
-    return int(STAMP.unpack(frame.prefix)[0]) & ~3
+def _stamps(table: FrameTable) -> tuple[Stamps, Mask]:
+    """Stamps of the frames, and which frames have one."""
+    stamped = table.cuts["prefix"] >= STAMP.size
+    stamps = np.zeros(len(table), np.uint64)
+    if stamped.any():
+        content = np.frombuffer(table.buffer, np.uint8)
+        places = np.lib.stride_tricks.sliding_window_view(content, STAMP.size)
+        stamps[stamped] = places[table.cuts["start"][stamped] - STAMP.size].view(">u8")[:, 0]
+    return stamps & ~np.uint64(3), stamped
+
+
+def _run(mask: Mask, start: int) -> int:
+    """Where a run of True that goes on at `start` ends."""
+    rest = mask[start:]
+    return start + int(rest.argmin()) if not rest.all() else len(mask)
 
 
 def _prefix_size(start: bytes) -> int:
     """Size of the stamps of a log: 0 if most frames adjoin each other."""
-    stamped = FrameParser(STAMP.size).receive_data(start)
-    bare = FrameParser().receive_data(start)
-    adjoining = sum(not frame.prefix for frame in stamped) + len(bare) - len(stamped)
+    stamped = FrameParser(STAMP.size).receive_table(start)
+    bare = FrameParser().receive_table(start)
+    adjoining = np.count_nonzero(stamped.cuts["prefix"] == 0) + len(bare) - len(stamped)
     return 0 if 2 * adjoining > len(bare) else STAMP.size

@@ -74,7 +74,11 @@ Array<double> relative_bias(const risaf::Risaf& fusion) {
 
 }  // namespace
 
+void bind_frames(nb::module_& m);
+
 NB_MODULE(_kernel, m) {
+  bind_frames(m);
+
   nb::class_<risaf::RobustParameters> parameters(m, "RobustParameters");
   parameters.def(nb::init<>());
   const auto field = [&parameters](const char* name, double risaf::RobustParameters::*member) {

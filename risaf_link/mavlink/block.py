@@ -1,0 +1,142 @@
+"""Whole epochs out of tables of frames, many at once, where all goes as usual.
+
+What is usual: the array is the one that is listened to, and its scale is known; its frames bring
+epoch after epoch, whole, with all sensors in order, numbered one by one; and nothing waits for what
+is missing. Whatever else the pipeline reads is handed on frame by frame, in its place. So nothing
+comes out otherwise than it would frame by frame; it only comes sooner.
+
+Of an epoch into which such a frame falls, some chunks are taken too late if that frame is one that
+has nothing to do with the array. They are not enough for an epoch, so that does not matter.
+
+The kernel finds the epochs. Where it was not built, every frame is handed on alone.
+"""
+
+from collections.abc import Iterator
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.epoch import EpochAssembler, GyroChunk, RegularEpochs, Source
+from risaf_link.mavlink.frame import Frame, FrameTable
+from risaf_link.mavlink.gps import READERS
+from risaf_link.mavlink.ingest import NONE, ArrayInfo, Ingest
+from risaf_link.mavlink.tlog import Stamps
+
+if TYPE_CHECKING:
+    from risaf_link.core import _kernel
+else:
+    try:
+        from risaf_link.core import _kernel
+    except ImportError:
+        _kernel = None
+
+
+class Kind(IntEnum):
+    """What is done with a message."""
+
+    IGNORED = 0  # nothing is read from it
+    ASIDE = 1  # it has nothing to do with the array
+    APART = 2  # it may change what the array's frames mean, or which array is listened to
+    GYROS = 3
+    FORCES = 4
+
+
+class BlockReader:
+    """Reads tables of frames for a pipeline.
+
+    Parameters
+    ----------
+    ingest : Ingest
+    assembler : EpochAssembler
+        Of the pipeline: blocks are taken here, what comes alone is taken there.
+    """
+
+    def __init__(self, ingest: Ingest, assembler: EpochAssembler) -> None:
+        self._ingest, self._assembler = ingest, assembler
+        self._kinds = _kinds(ingest)
+        self._layout: _kernel.ArrayLayout
+        self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
+        self._finder = _kernel.EpochFinder(list(self._kinds)) if _kernel else None
+
+    def read(
+        self, table: FrameTable, times_us: Stamps
+    ) -> Iterator[RegularEpochs | tuple[Frame, int]]:
+        """Read the next frames of a log.
+
+        Parameters
+        ----------
+        table : FrameTable
+        times_us : ndarray of uint64
+            When each frame was received.
+
+        Yields
+        ------
+        RegularEpochs, or Frame and int
+            What follows next in the log. Ingest and assembler have taken a block already. A frame,
+            with its time, must have gone through them when the next item is asked for.
+        """
+        if self._finder is None:
+            rows = np.flatnonzero(np.isin(table.cuts["message_id"], np.flatnonzero(self._kinds)))
+            yield from ((table.frame(row), int(times_us[row])) for row in rows.tolist())
+            return
+        self._finder.load(table.buffer, table.cuts.view(np.uint8), times_us)
+        while True:
+            most = self._assembler.until_review
+            block = self._block(times_us, most)
+            if block is not None:
+                yield block
+                if len(block) == most:
+                    continue
+            row = self._finder.single()
+            if row == len(table):
+                return
+            yield table.frame(row), int(times_us[row])
+
+    def _block(self, times_us: Stamps, most: int) -> RegularEpochs | None:
+        source, last = self._assembler.source, self._assembler.last
+        if self._finder is None or source is None or last is None or last.sequence is None:
+            return None
+        info = self._ingest.info_of_counts(source)
+        if source != self._ingest.source or not self._assembler.is_steady(info.sensors):
+            return None
+        self._lay_out(source, info)
+        found = self._finder.take(self._layout, last.time_us, last.sequence, most)
+        if found is None:
+            return None
+        columns, (newest, begun, heard, sequence), unusable = found
+        time_us = int(columns[0][-1])
+        chunks = (
+            GyroChunk(source, time_us, int(times_us[row]), 0, NONE, NONE, sequence, info.sensors)
+            for row in (newest, begun)
+        )
+        block = RegularEpochs(*columns, *chunks)
+        self._ingest.take_block(int(times_us[heard]), *unusable)
+        self._assembler.take_block(block)
+        return block
+
+    def _lay_out(self, source: Source, info: ArrayInfo) -> None:
+        wanted = (source, info, self._assembler.sensors, self._assembler.forces)
+        if wanted != self._laid_out:
+            *_, gyros, forces = wanted
+            self._laid_out = wanted
+            self._layout = _kernel.ArrayLayout(
+                source.system,
+                source.component,
+                source.array_id,
+                _kernel.Sensors(gyros, *info.count_of(is_gyro=True)),
+                _kernel.Sensors(forces, *info.count_of(is_gyro=False)),
+            )
+
+
+def _kinds(ingest: Ingest) -> bytearray:
+    """Kind of every message, by its id."""
+    kinds = dict.fromkeys(ingest.message_ids, Kind.APART)
+    aside = {IDS[name] for name in (*READERS, "HEARTBEAT", "SYSTEM_TIME")}
+    kinds |= dict.fromkeys(aside & {*ingest.message_ids, IDS["SYSTEM_TIME"]}, Kind.ASIDE)
+    kinds |= {IDS["GYRO_ARRAY"]: Kind.GYROS, IDS["ACCEL_ARRAY"]: Kind.FORCES}
+    by_id = bytearray(max(kinds) + 1)
+    for message_id, kind in kinds.items():
+        by_id[message_id] = kind
+    return by_id

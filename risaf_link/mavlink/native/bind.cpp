@@ -1,0 +1,137 @@
+// What reads frames, as a part of the kernel's Python module.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/map.h>
+#include <nanobind/stl/vector.h>
+
+#include <map>
+
+#include "epochs.hpp"
+#include "frames.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+const std::uint8_t* data(const nb::bytes& bytes) {
+  return static_cast<const std::uint8_t*>(bytes.data());
+}
+
+// `cut` in frame.py, for the messages that are known.
+class Cutter {
+ public:
+  std::size_t summed = 0;  // bytes that went through a checksum
+
+  explicit Cutter(const std::map<std::uint32_t, std::uint8_t>& extras)
+      : extras_(extras.empty() ? 0 : extras.rbegin()->first + 1, -1) {
+    for (const auto& [message_id, extra] : extras) {
+      extras_[message_id] = extra;
+    }
+  }
+
+  nb::tuple cut(const nb::bytes& buffer, std::size_t prefix_size, std::size_t done, bool in_step,
+                bool ended) {
+    risaf::Search search(extras_, data(buffer), buffer.size(), prefix_size, ended);
+    const auto [rest, follows] = search.cut(done, in_step);
+    summed += search.summed;
+    const auto& dropped = search.dropped;
+    return nb::make_tuple(
+        nb::bytes(search.cuts.data(), search.cuts.size() * sizeof(risaf::Cut)), search.keep, rest,
+        follows, search.skipped, nb::make_tuple(dropped[0], dropped[1], dropped[2], dropped[3]));
+  }
+
+ private:
+  risaf::Search::Extras extras_;
+};
+
+template <typename T>
+using Array = nb::ndarray<nb::numpy, T>;
+template <typename T>
+using Column = nb::ndarray<const T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+
+template <typename T>
+Array<T> made(std::initializer_list<std::size_t> shape) {
+  std::size_t size = 1;
+  for (const std::size_t length : shape) {
+    size *= length;
+  }
+  auto* values = new T[size];
+  nb::capsule owner(values, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  return Array<T>(values, shape, owner);
+}
+
+// Whole epochs out of a table, as block.py wants them.
+class EpochFinder {
+ public:
+  explicit EpochFinder(std::vector<std::uint8_t> kinds) : finder_(std::move(kinds)) {}
+
+  void load(nb::bytes buffer, Column<std::uint8_t> cuts, Column<std::uint64_t> times_us) {
+    const std::size_t size = times_us.shape(0);
+    if (cuts.shape(0) != size * sizeof(risaf::Cut)) {
+      throw nb::value_error("cuts: not as many as times");
+    }
+    finder_.load(data(buffer), reinterpret_cast<const risaf::Cut*>(cuts.data()), times_us.data(),
+                 size);
+    buffer_ = std::move(buffer);
+    cuts_ = std::move(cuts);
+    times_us_ = std::move(times_us);
+  }
+
+  nb::object take(const risaf::ArrayLayout& array, std::int64_t time_us, std::uint16_t sequence,
+                  std::size_t most) {
+    risaf::Clock clock{time_us, sequence};
+    const auto& epochs = finder_.take(array, &clock, most);
+    const std::size_t size = epochs.size();
+    if (size == 0) {
+      return nb::none();
+    }
+    auto times = made<std::int64_t>({size}), received = made<std::int64_t>({size}),
+         rows = made<std::int64_t>({size});
+    auto dt = made<double>({size});
+    for (std::size_t i = 0; i < size; ++i) {
+      times.data()[i] = epochs[i].time_us;
+      dt.data()[i] = static_cast<double>(epochs[i].time_us - time_us) / 1e6;
+      received.data()[i] = static_cast<std::int64_t>(times_us_.data()[epochs[i].end]);
+      rows.data()[i] = static_cast<std::int64_t>(epochs[i].end);
+      time_us = epochs[i].time_us;
+    }
+    auto rates = made<double>({size, array.gyros.count, 3});
+    auto forces = made<double>({size, array.accels.count, 3});
+    const auto of_gyros = finder_.read(array.gyros, true, rates.data());
+    const auto of_accels = finder_.read(array.accels, false, forces.data());
+    const auto& last = epochs.back();
+    return nb::make_tuple(nb::make_tuple(times, dt, rates, forces, received, rows),
+                          nb::make_tuple(last.newest, last.begun, last.heard, clock.sequence),
+                          nb::make_tuple(of_gyros.invalid + of_accels.invalid,
+                                         of_gyros.saturated + of_accels.saturated));
+  }
+
+  std::size_t single() { return finder_.single(); }
+
+ private:
+  risaf::EpochFinder finder_;
+  nb::object buffer_;
+  Column<std::uint8_t> cuts_;
+  Column<std::uint64_t> times_us_;
+};
+
+}  // namespace
+
+void bind_frames(nb::module_& m) {
+  nb::class_<Cutter>(m, "Cutter")
+      .def(nb::init<const std::map<std::uint32_t, std::uint8_t>&>(), "extras"_a)
+      .def_ro("summed", &Cutter::summed)
+      .def("cut", &Cutter::cut, "buffer"_a, "prefix_size"_a, "done"_a, "in_step"_a, "ended"_a);
+
+  nb::class_<risaf::Sensors>(m, "Sensors")
+      .def(nb::init<std::size_t, double, double>(), "count"_a, "scale"_a, "limit"_a);
+  nb::class_<risaf::ArrayLayout>(m, "ArrayLayout")
+      .def(nb::init<std::uint8_t, std::uint8_t, std::uint8_t, risaf::Sensors, risaf::Sensors>(),
+           "system"_a, "component"_a, "array_id"_a, "gyros"_a, "accels"_a);
+  nb::class_<EpochFinder>(m, "EpochFinder")
+      .def(nb::init<std::vector<std::uint8_t>>(), "kinds"_a)
+      .def("load", &EpochFinder::load, "buffer"_a, "cuts"_a, "times_us"_a)
+      .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a, "most"_a)
+      .def("single", &EpochFinder::single);
+}

@@ -1,0 +1,223 @@
+// Whole epochs of one array out of a table of frames, as long as all is as usual. What is not is left
+// to `Ingest` and `EpochAssembler`, and so is the meaning of all this: `block.py` says what is usual.
+#pragma once
+
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <utility>
+#include <vector>
+
+#include "frames.hpp"
+
+namespace risaf {
+
+enum Kind : std::uint8_t { IGNORED, ASIDE, APART, GYROS, FORCES };  // of a message: `Kind` in block.py
+
+// Sensors of one kind.
+struct Sensors {
+  std::size_t count;
+  double scale, limit;  // of a count of the message; what is as large, or larger, is saturated
+};
+
+struct ArrayLayout {
+  std::uint8_t system, component, array_id;
+  Sensors gyros, accels;
+};
+
+// How the last epoch ended, and this one may go on.
+struct Clock {
+  std::int64_t time_us;
+  std::uint16_t sequence;
+};
+
+struct EpochRows {
+  std::size_t newest, begun, heard, end;  // first frame; first and last of the gyros; last of all
+  std::int64_t time_us;
+};
+
+struct Unusable {
+  std::size_t invalid = 0, saturated = 0;
+};
+
+class EpochFinder {
+ public:
+  static constexpr std::int64_t JUMP_US = 1'000'000, LATEST_US = std::int64_t{1} << 62;
+  static constexpr std::size_t HEAD = 12, COUNT = 252, ARRAY_ID = 253, CAPACITY = 40;
+  static constexpr std::int16_t INVALID = -32768;
+
+  explicit EpochFinder(std::vector<std::uint8_t> kinds) : kinds_(std::move(kinds)) {}
+
+  // Begin with a table, which must outlive its use.
+  void load(const std::uint8_t* buffer, const Cut* cuts, const std::uint64_t* times_us,
+            std::size_t size) {
+    buffer_ = buffer;
+    cuts_ = cuts;
+    times_us_ = times_us;
+    size_ = size;
+    at_ = handed_ = 0;
+    aside_ = NOWHERE;
+  }
+
+  // Take whole epochs, up to the first frame that is not as usual, or that must be handed on between
+  // two of them. They stay known until the next call; `clock` is that of the last one, then.
+  const std::vector<EpochRows>& take(const ArrayLayout& array, Clock* clock, std::size_t most) {
+    epochs_.clear();
+    chunks_.clear();
+    aside_ = NOWHERE;
+    EpochRows epoch{};
+    Clock now = *clock;
+    std::size_t whole_chunks = 0, gyros = 0, forces = 0;
+    for (std::size_t row = at_; row < size_ && epochs_.size() < most; ++row) {
+      const Kind kind = kind_of(row);
+      if (kind == IGNORED || (kind == ASIDE && row < handed_)) {
+        continue;
+      }
+      Chunk chunk;
+      if (kind == ASIDE) {
+        aside_ = row;
+      }
+      if (kind == ASIDE || kind == APART || !read(array, row, kind == GYROS, &chunk)) {
+        break;
+      }
+      std::size_t& come = chunk.is_gyro ? gyros : forces;
+      const bool is_first = gyros + forces == 0;
+      const std::int64_t step_us = chunk.clock.time_us - clock->time_us;
+      if (chunk.first != come || (is_first ? step_us <= 0 || step_us > JUMP_US
+                                           : chunk.clock.time_us != epoch.time_us)) {
+        break;
+      }
+      if (is_first) {
+        epoch.newest = row;
+        epoch.time_us = chunk.clock.time_us;
+      }
+      if (chunk.is_gyro) {
+        const auto next = static_cast<std::uint16_t>(clock->sequence + 1);
+        if (come == 0 && chunk.clock.sequence != next) {
+          break;
+        }
+        if (come == 0) {
+          epoch.begun = row;
+          now = chunk.clock;
+        }
+        epoch.heard = row;
+      }
+      come += chunk.count;
+      chunk.epoch = epochs_.size();
+      chunks_.push_back(chunk);
+      if (gyros == array.gyros.count && forces == array.accels.count) {
+        epoch.end = row;
+        epochs_.push_back(epoch);
+        *clock = now;
+        gyros = forces = 0;
+        whole_chunks = chunks_.size();
+        at_ = row + 1;
+      }
+    }
+    chunks_.resize(whole_chunks);
+    return epochs_;
+  }
+
+  // Readings of the epochs that were taken, (epochs, sensors, 3).
+  Unusable read(const Sensors& sensors, bool is_gyro, double* values) const {
+    Unusable unusable;
+    for (const Chunk& chunk : chunks_) {
+      if (chunk.is_gyro == is_gyro) {
+        double* to = values + 3 * (chunk.epoch * sensors.count + chunk.first);
+        convert(chunk.readings, 3 * chunk.count, sensors, to, &unusable);
+      }
+    }
+    return unusable;
+  }
+
+  // The next frame that is to be handed on alone; the size of the table: there is none.
+  std::size_t single() {
+    if (aside_ != NOWHERE) {
+      handed_ = aside_ + 1;
+      return std::exchange(aside_, NOWHERE);
+    }
+    while (at_ < size_) {
+      const std::size_t row = at_++;
+      const Kind kind = kind_of(row);
+      if (kind != IGNORED && (kind != ASIDE || row >= handed_)) {
+        return row;
+      }
+    }
+    return size_;
+  }
+
+ private:
+  static constexpr std::size_t NOWHERE = std::numeric_limits<std::size_t>::max();
+
+  struct Chunk {
+    bool is_gyro;
+    std::size_t epoch, first, count;
+    Clock clock;
+    const std::uint8_t* readings;
+  };
+
+  Kind kind_of(std::size_t row) const {
+    const std::uint32_t message_id = cuts_[row].message_id;
+    return message_id < kinds_.size() ? static_cast<Kind>(kinds_[message_id]) : IGNORED;
+  }
+
+  template <typename T>
+  static T number(const std::uint8_t* bytes) {
+    static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "as on the wire");
+    T value;
+    std::memcpy(&value, bytes, sizeof(T));
+    return value;
+  }
+
+  // Read the head of GYRO_ARRAY or ACCEL_ARRAY; whether it is of the array and can be used.
+  bool read(const ArrayLayout& array, std::size_t row, bool is_gyro, Chunk* chunk) const {
+    const Cut& cut = cuts_[row];
+    const std::uint8_t* payload = buffer_ + cut.payload();
+    if (cut.size <= COUNT || cut.system != array.system || cut.component != array.component ||
+        (cut.size > ARRAY_ID ? payload[ARRAY_ID] : 0) != array.array_id ||
+        times_us_[row] > static_cast<std::uint64_t>(LATEST_US)) {
+      return false;
+    }
+    const auto time_us = number<std::uint64_t>(payload);
+    *chunk = {is_gyro, 0, number<std::uint16_t>(payload + 10), payload[COUNT],
+              {static_cast<std::int64_t>(time_us), number<std::uint16_t>(payload + 8)},
+              payload + HEAD};
+    const Sensors& sensors = is_gyro ? array.gyros : array.accels;
+    return time_us <= static_cast<std::uint64_t>(LATEST_US) && chunk->count > 0 &&
+           chunk->count <= CAPACITY && chunk->first + chunk->count <= sensors.count &&
+           sensors.scale > 0.0;
+  }
+
+  static void convert(const std::uint8_t* bytes, std::size_t size, const Sensors& sensors,
+                      double* values, Unusable* unusable) {
+    std::int16_t counts[3 * CAPACITY];
+    std::memcpy(counts, bytes, size * sizeof(std::int16_t));
+    bool any = false;
+    for (std::size_t i = 0; i < size; ++i) {
+      values[i] = counts[i] * sensors.scale;
+      any |= std::abs(values[i]) >= sensors.limit;
+    }
+    for (std::size_t i = 0; any && i < size; ++i) {
+      if (std::abs(values[i]) >= sensors.limit) {
+        const bool is_invalid = counts[i] == INVALID || !std::isfinite(values[i]);
+        ++(is_invalid ? unusable->invalid : unusable->saturated);
+        values[i] = std::numeric_limits<double>::quiet_NaN();
+      }
+    }
+  }
+
+  std::vector<std::uint8_t> kinds_;  // by message id
+  const std::uint8_t* buffer_ = nullptr;
+  const Cut* cuts_ = nullptr;
+  const std::uint64_t* times_us_ = nullptr;
+  std::size_t size_ = 0;
+  std::size_t at_ = 0;          // all before it is done with
+  std::size_t handed_ = 0;      // before it, what is ASIDE
+  std::size_t aside_ = NOWHERE;  // where `take` has stopped, if at such a frame
+  std::vector<EpochRows> epochs_;
+  std::vector<Chunk> chunks_;
+};
+
+}  // namespace risaf
