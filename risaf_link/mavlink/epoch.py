@@ -20,7 +20,7 @@ What the gyros read at one instant is an epoch. The rules:
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from itertools import pairwise
+from operator import sub
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -210,7 +210,7 @@ class EpochAssembler:
             roster.close_whole(times_us)
         self.counts["epochs"] += len(block)
         recent_us = [self._last.time_us, *times_us][-STEPS - 1 :]
-        self._steps_us.extend(later - earlier for earlier, later in pairwise(recent_us))
+        self._steps_us.extend(map(sub, recent_us[1:], recent_us))
         self._newest = block.newest
         self._close_steps(block.begun)
 

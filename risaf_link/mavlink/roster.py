@@ -1,7 +1,6 @@
 """The sensors of one kind in an array: which of them take part, and which samples have come."""
 
 from dataclasses import dataclass
-from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 
 from risaf_link.core.rotation import Floats
 
-REMEMBERED = 64  # instants handed on, to tell late samples from duplicates
+REMEMBERED = 64  # instants handed on, at least, to tell late samples from duplicates
 
 Mask = NDArray[np.bool_]
 T = TypeVar("T", bound=np.generic)
@@ -117,8 +116,7 @@ class Roster:
     def close(self, time_us: int) -> Instant:
         """Hand on what was read at a time."""
         instant = self.gone[time_us] = self.open.pop(time_us)
-        if len(self.gone) > REMEMBERED:
-            del self.gone[next(iter(self.gone))]
+        self._forget_old()
         return instant
 
     def close_whole(self, times_us: list[int]) -> None:
@@ -127,9 +125,14 @@ class Roster:
             return
         self.see(self.size)
         self.attended += len(times_us)
-        self.gone.update(dict.fromkeys(times_us[-REMEMBERED:], self.size))
-        for time_us in list(islice(self.gone, max(0, len(self.gone) - REMEMBERED))):
-            del self.gone[time_us]
+        self.gone.update(dict.fromkeys(times_us, self.size))
+        self._forget_old()
+
+    def _forget_old(self) -> None:
+        """Keep half of the instants handed on whenever there are twice as many as needed."""
+        if len(self.gone) >= 2 * REMEMBERED:
+            keep = REMEMBERED + len(self.gone) % REMEMBERED
+            self.gone = dict(list(self.gone.items())[-keep:])
 
     def recall(self, time_us: int) -> Instant | None:
         """What was handed on of late that had been read at a time."""

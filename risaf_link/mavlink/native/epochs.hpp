@@ -2,9 +2,11 @@
 // to `Ingest` and `EpochAssembler`, and so is the meaning of all this: `block.py` says what is usual.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <limits>
 #include <utility>
@@ -194,13 +196,22 @@ class EpochFinder {
                       double* values, Unusable* unusable) {
     std::int16_t counts[3 * CAPACITY];
     std::memcpy(counts, bytes, size * sizeof(std::int16_t));
-    bool any = false;
+    int largest = 0;
+    for (std::size_t i = 0; i < size; ++i) {
+      largest = std::max(largest, std::abs(static_cast<int>(counts[i])));
+    }
     for (std::size_t i = 0; i < size; ++i) {
       values[i] = counts[i] * sensors.scale;
-      any |= std::abs(values[i]) >= sensors.limit;
     }
-    for (std::size_t i = 0; any && i < size; ++i) {
-      if (std::abs(values[i]) >= sensors.limit) {
+    if (largest * sensors.scale >= sensors.limit) {
+      clean(counts, size, sensors.limit, values, unusable);
+    }
+  }
+
+  static void clean(const std::int16_t* counts, std::size_t size, double limit, double* values,
+                    Unusable* unusable) {
+    for (std::size_t i = 0; i < size; ++i) {
+      if (std::abs(values[i]) >= limit) {
         const bool is_invalid = counts[i] == INVALID || !std::isfinite(values[i]);
         ++(is_invalid ? unusable->invalid : unusable->saturated);
         values[i] = std::numeric_limits<double>::quiet_NaN();
