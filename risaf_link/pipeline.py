@@ -19,7 +19,7 @@ from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.attitude import AttitudeParameters, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.estimate import ArrayStatus, Estimate
-from risaf_link.core.fusion import Epoch, Fusion, FusionParameters, Mean, Median
+from risaf_link.core.fusion import Epoch, Fusion, FusionParameters
 from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import ArrayHealth
@@ -32,8 +32,8 @@ from risaf_link.mavlink.ingest import GpsParameters, Ingest
 FUSIONS: dict[str, Callable[[FusionParameters], Fusion]] = {
     "robust": kernel.Robust,
     "risaf": kernel.Risaf,
-    "median": Median,
-    "mean": Mean,
+    "median": kernel.Median,
+    "mean": kernel.Mean,
 }
 FORCE_RESOLUTION = 0.02  # m/s^2; no accelerometer is blamed for less
 HEALTH_PERIOD = 0.1  # s, from one judgement of the sensors to the next

@@ -14,6 +14,7 @@ from risaf_link.core.fusion import Epoch, FusionParameters, Mean, Median, quanti
 
 AGREEMENT = 1e-9  # rad/s
 FUSIONS = {"risaf": numpy_forms.Risaf, "mean": Mean, "median": Median}
+KERNEL = {"risaf": kernel.Risaf, "mean": kernel.Mean, "median": kernel.Median}
 
 
 @pytest.fixture(params=["numpy", "kernel"], autouse=True)
@@ -22,7 +23,8 @@ def _form(request, monkeypatch):
     if request.param == "kernel":
         if not kernel.BUILT:
             pytest.skip("no kernel was built: that takes a C++ compiler")
-        monkeypatch.setitem(FUSIONS, "risaf", kernel.Risaf)
+        for name, form in KERNEL.items():
+            monkeypatch.setitem(FUSIONS, name, form)
 
 
 # A coarse grid gives ties at the quantiles, as the counts of a real sensor do.

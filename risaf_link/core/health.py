@@ -64,8 +64,13 @@ class SilenceMonitor:
 
     def health(self, relative_bias: Floats | None = None) -> ArrayHealth:
         """Judge the sensors as of the last epoch; `relative_bias` (n, 3), rad/s."""
-        silent, n = self._silent_for > 0.0, len(self._silent_for)
-        state = silent.astype(np.int8) + (self._silent_for > SILENT_AFTER)
-        bias = np.zeros((n, 3)) if relative_bias is None else relative_bias
-        reason = np.where(silent, Reason.SILENT, Reason.NONE).astype(np.int8)
-        return ArrayHealth(state.astype(np.int8), reason, np.zeros(n), bias)
+        return judge_silence(self._silent_for, relative_bias)
+
+
+def judge_silence(silent_for: Floats, relative_bias: Floats | None = None) -> ArrayHealth:
+    """Judge n sensors by for how long each has been silent, s; `relative_bias` (n, 3), rad/s."""
+    silent, n = silent_for > 0.0, len(silent_for)
+    state = silent.astype(np.int8) + (silent_for > SILENT_AFTER)
+    bias = np.zeros((n, 3)) if relative_bias is None else relative_bias
+    reason = np.where(silent, Reason.SILENT, Reason.NONE).astype(np.int8)
+    return ArrayHealth(state.astype(np.int8), reason, np.zeros(n), bias)

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
 from risaf_link.core import fusion, robust
-from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
-from risaf_link.core.health import SILENT_AFTER, ArrayHealth, SilenceMonitor
+from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate, Fusion, FusionParameters
+from risaf_link.core.health import SILENT_AFTER, ArrayHealth, judge_silence
 from risaf_link.core.rotation import Floats
 
 if TYPE_CHECKING:
@@ -32,6 +31,37 @@ _SHARED = (
 )
 
 
+class _Mean:
+    """`fusion.Mean` in C++."""
+
+    def __init__(self, parameters: FusionParameters) -> None:
+        self._kernel = _kernel.Mean(parameters.gyro_noise, parameters.bias_walk)
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return judge_silence(self._kernel.silent_for())
+
+    def fuse(self, epoch: Epoch) -> FusedRate:
+        """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
+        return _fuse(self._kernel, epoch.time_us, epoch.dt, epoch.rates_b)
+
+
+class _Median:
+    """`fusion.Median` in C++."""
+
+    def __init__(self, parameters: FusionParameters) -> None:
+        p = parameters
+        self._kernel = _kernel.Median(p.gyro_noise, p.bias_walk, MAD_TO_STD)
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return judge_silence(self._kernel.silent_for())
+
+    def fuse(self, epoch: Epoch) -> FusedRate:
+        """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
+        return _fuse(self._kernel, epoch.time_us, epoch.dt, epoch.rates_b)
+
+
 class _Risaf:
     """`fusion.Risaf` in C++."""
 
@@ -40,7 +70,6 @@ class _Risaf:
         self._kernel = _kernel.Risaf(
             p.alpha, p.lower_quantile, p.upper_quantile, p.gyro_noise, p.bias_walk
         )
-        self._silence = SilenceMonitor()
 
     @property
     def relative_bias(self) -> Floats:
@@ -49,12 +78,11 @@ class _Risaf:
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch, by their silence alone."""
-        return self._silence.health(self.relative_bias)
+        return judge_silence(self._kernel.silent_for(), self.relative_bias)
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
-        self._silence.watch(epoch.rates_b, epoch.dt)
-        return _fused(epoch.time_us, self._kernel.fuse(epoch.dt, epoch.rates_b))
+        return _fuse(self._kernel, epoch.time_us, epoch.dt, epoch.rates_b)
 
 
 class _Robust:
@@ -86,17 +114,21 @@ class _Robust:
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
-        return self.fuse_readings(epoch.time_us, epoch.dt, epoch.rates_b)
+        return _fuse(self._kernel, epoch.time_us, epoch.dt, epoch.rates_b)
 
     def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> FusedRate:
         """Fuse what sensors of one kind read at one instant, (n, 3)."""
-        return _fused(time_us, self._kernel.fuse(dt, readings))
+        return _fuse(self._kernel, time_us, dt, readings)
 
 
-def _fused(time_us: int, parts: tuple[Floats, NDArray[np.int64], int]) -> FusedRate:
-    (rate, variance, noise, bias_walk), active, valid = parts
+def _fuse(kernel: "_kernel._Fusion", time_us: int, dt: float, readings: Floats) -> FusedRate:
+    values, active = np.empty((4, 3)), np.empty(3, np.int64)
+    valid = kernel.fuse(dt, readings, values, active)
+    rate, variance, noise, bias_walk = values
     return FusedRate(time_us, rate, variance, active, valid, noise, bias_walk)
 
 
+Mean: Callable[[FusionParameters], Fusion] = _Mean if BUILT else fusion.Mean
+Median: Callable[[FusionParameters], Fusion] = _Median if BUILT else fusion.Median
 Risaf: Callable[[FusionParameters], Fusion] = _Risaf if BUILT else fusion.Risaf
 Robust = _Robust if BUILT else robust.Robust
