@@ -23,8 +23,8 @@ Array owned(double* values, std::initializer_list<std::size_t> shape) {
   return Array(values, shape, owner);
 }
 
-// Fuse into values (4, 3), the rows as of FusedAxis, and active (3,), which are the caller's; how many
-// sensors are valid on all axes.
+// Fuse into the caller's values (4, 3), rows as of FusedAxis, and active (3,); how many sensors are
+// valid on all axes.
 template <typename Fusion>
 std::int64_t fuse(Fusion& fusion, double dt, const Readings& readings, const Values& values,
                   const Active& active) {
@@ -52,7 +52,8 @@ Array by_axis(std::size_t n, RowOf row) {
 
 // What is remembered of each channel under a name, shape (3, n).
 Array channels(const risaf::Robust& robust, risaf::Row risaf::Robust::Axis::*member) {
-  return by_axis(robust.sensors(), [&](std::size_t k) -> const risaf::Row& { return robust.axis(k).*member; });
+  return by_axis(robust.sensors(),
+                 [&](std::size_t k) -> const risaf::Row& { return robust.axis(k).*member; });
 }
 
 // All that is remembered, by the names of `Channels`.

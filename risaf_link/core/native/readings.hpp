@@ -65,11 +65,13 @@ struct OneSensor {
     const double sensors = count > 0.0 ? count : NaN;
     const double one = dt > 0.0 ? gyro_noise * gyro_noise / dt : NaN;
     const double noise = (std::isnan(variance) ? one : variance) / sensors;
-    return {rate, variance, noise, bias_walk / std::sqrt(sensors), static_cast<std::int64_t>(count)};
+    const double walk = bias_walk / std::sqrt(sensors);
+    return {rate, variance, noise, walk, static_cast<std::int64_t>(count)};
   }
 
   // `_mean_of_active` of fusion.py: eq. 7 and 8.
-  FusedAxis mean_of_active(double dt, const Row& rates, const Row& active, std::size_t length) const {
+  FusedAxis mean_of_active(double dt, const Row& rates, const Row& active,
+                           std::size_t length) const {
     const double count = sum(length, [&](std::size_t i) { return active[i]; });
     const double total =
         sum(length, [&](std::size_t i) { return where(active[i] > 0.0, rates[i], 0.0); });

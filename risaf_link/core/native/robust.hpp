@@ -56,7 +56,8 @@ class Robust {
       choose_jury(a);
       find_centre(a, dt);
     }
-    const double least = std::hypot(p.resolution, unscaled(axes_[0].centre, axes_[1].centre, axes_[2].centre));
+    const double least = std::hypot(
+        p.resolution, unscaled(axes_[0].centre, axes_[1].centre, axes_[2].centre));
     const double least_slow = std::hypot(
         p.resolution, p.gate * unscaled(axes_[0].turning, axes_[1].turning, axes_[2].turning));
     for (Axis& a : axes_) {
@@ -157,15 +158,15 @@ class Robust {
     select(a.offset, a.jury);
     const double centre = a.centres.median(values_.data(), length(), a.jury_count);
     const double step = centre - a.centre;
-    a.nearest = INFINITE;
     RISAF_EACH
     for (std::size_t i = 0; i < length(); ++i) {
       a.moved[i] = where(a.unchanged[i] > 0.0, a.moved[i] + step, 0.0);
       a.offset[i] -= centre;
       values_[i] = where(a.jury[i] > 0.0, std::abs(a.offset[i]), INFINITE);
     }
+    const std::size_t n = a.jury_count;
     a.nearest = least(length(), [this](std::size_t i) { return values_[i]; });
-    a.now_spread = deviation(a.jury_count, a.spreads.median(values_.data(), length(), a.jury_count));
+    a.now_spread = deviation(n, a.spreads.median(values_.data(), length(), n));
     a.centre = centre;
     a.turning += dt / p.watch_time * (centre - a.turning);
   }
@@ -229,7 +230,7 @@ class Robust {
     a.jitter += share(dt, p.spread_time) * (size - a.jitter);
   }
 
-  // How far from their centre z may be; what they are from it is left in `values_`.
+  // How far from their centre z may be.
   double slow_limit(Axis& a, double least, double dt) {
     const std::size_t n = a.changing_count;
     select(a.slow, a.changing);
@@ -248,13 +249,15 @@ class Robust {
 
   void trust(Axis& a, double slow_limit, double dt) {
     const std::size_t trusting = flagged(a.trusted);
-    const double usual = sum(length(), [&a](std::size_t i) { return a.rejected[i] * a.trusted[i]; }) /
-                         static_cast<double>(std::max<std::size_t>(trusting, 1));
+    const double sum_of_shares =
+        sum(length(), [&a](std::size_t i) { return a.rejected[i] * a.trusted[i]; });
+    const double usual = sum_of_shares / static_cast<double>(std::max<std::size_t>(trusting, 1));
     const double burst = usual + p.burst, silent_after = p.silent_after, hold_time = p.hold_time;
     const double relearn = p.relearn, centre = a.slow_centre;
     RISAF_EACH
     for (std::size_t i = 0; i < length(); ++i) {
-      const bool outlying = a.rejected[i] > burst, wandering = std::abs(a.slow[i] - centre) > slow_limit;
+      const bool outlying = a.rejected[i] > burst;
+      const bool wandering = std::abs(a.slow[i] - centre) > slow_limit;
       const bool alarm = outlying | wandering | (a.frozen[i] > 0.0) | (a.silent[i] > silent_after);
       a.calm[i] = where(alarm, 0.0, a.calm[i] + dt);
       const bool trusted = a.calm[i] >= hold_time;
@@ -286,7 +289,8 @@ class Robust {
     for (std::size_t k = 0; k < 3; ++k) {
       Axis& a = axes_[k];
       const double count = a.active_count ? static_cast<double>(a.active_count) : NaN;
-      double slow = sum(length(), [&a](std::size_t i) { return a.active[i] * a.slow[i] * a.slow[i]; });
+      double slow =
+          sum(length(), [&a](std::size_t i) { return a.active[i] * a.slow[i] * a.slow[i]; });
       slow = a.active_count ? slow / std::max(count - 1.0, 1.0) : NaN;
       double white = a.noise - slow;
       white = std::isnan(white) ? NaN : std::max(white, p.least_white * a.noise);

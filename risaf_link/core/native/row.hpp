@@ -1,41 +1,54 @@
-// Rows of channels, in whole eights, so that loops over them need no rest.
+// Rows of channels, in whole eights, so that the compiler's vectors leave no rest.
 //
-// What a loop does to a row does not depend on the width of the processor's vectors: sums have
-// eight parts everywhere, and nothing is contracted.
+// How wide the processor's vectors are makes no difference to the last bit: sums have eight parts
+// everywhere, and no product and sum are contracted into one.
 #pragma once
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <new>
 #include <vector>
 
 #include "fused.hpp"
 
 // A function with all it calls, built for several processors; which one it is, is seen at run time.
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
 #define RISAF_FAST [[gnu::target_clones("arch=x86-64-v4", "avx2", "default"), gnu::flatten]]
 #else
-#define RISAF_FAST
+#define RISAF_FAST [[gnu::flatten]]
 #endif
 
-// The loop that follows has no two rows that overlap.
 #if defined(__clang__)
-#define RISAF_EACH _Pragma("clang loop vectorize(assume_safety)")
-#else
-#define RISAF_EACH _Pragma("GCC ivdep")
-#endif
-
-// The loop that follows is one vector, or a few: not to be unrolled before that is seen.
-#if defined(__clang__)
+#define RISAF_EACH
 #define RISAF_PARTS
 #else
+// No two rows overlap in the loop that follows.
+#define RISAF_EACH _Pragma("GCC ivdep")
+// The loop that follows is one vector, or a few: it is not unrolled before that is seen.
 #define RISAF_PARTS _Pragma("GCC unroll 1")
 #endif
 
 namespace risaf {
 
-using Row = std::vector<double>;  // flags are 0 or 1
+// Lets no vector of the processor lie across two lines of its cache.
+template <typename T>
+struct Aligned {
+  using value_type = T;
+  static constexpr std::align_val_t LINE{64};
+
+  Aligned() = default;
+  template <typename U>
+  Aligned(const Aligned<U>&) {}
+
+  T* allocate(std::size_t n) { return static_cast<T*>(::operator new(n * sizeof(T), LINE)); }
+  void deallocate(T* values, std::size_t) { ::operator delete(values, LINE); }
+  bool operator==(const Aligned&) const { return true; }
+  bool operator!=(const Aligned&) const { return false; }
+};
+
+using Row = std::vector<double, Aligned<double>>;  // flags are 0 or 1
 
 // As NumPy's. By their bits, for a branch would keep the loop around it from being vectorised.
 inline double where(bool condition, double yes, double no) {
@@ -106,7 +119,8 @@ inline double least(std::size_t n, Term term) {
 // How many of i below n are so.
 template <typename Test>
 inline std::size_t count(std::size_t n, Test test) {
-  return static_cast<std::size_t>(sum(n, [test](std::size_t i) { return where(test(i), 1.0, 0.0); }));
+  const double found = sum(n, [test](std::size_t i) { return where(test(i), 1.0, 0.0); });
+  return static_cast<std::size_t>(found);
 }
 
 }  // namespace risaf

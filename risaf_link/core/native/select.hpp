@@ -21,15 +21,16 @@ struct Pair {
 // To look from a bound is to count the values up to it, and to see the next above. Where k are
 // counted, the next is order statistic k: it becomes the bound, and its count, more than k, proves
 // it. The first bound is just below what was found the last time; then, in strides of twice the
-// length, one on the other side is looked for; between the two, false position (the Illinois form:
-// Dowell and Jarratt, "A Modified Regula Falsi Method", BIT 11, 1971) goes for a count of k. Where
-// the first bound was has no influence on what is found, only on how long it takes.
+// length, one on the other side is looked for; between the two, false position goes for a count of
+// k, in the Illinois form: Dowell and Jarratt, "A modified regula falsi method for computing the
+// root of an equation", BIT 11, 1971. Where the first bound was has no influence on what is found,
+// only on how long it takes.
 class Selection {
  public:
   // Order statistics k and k + 1 of n values; what else is in the row, to its length, is infinite.
   RISAF_FAST Pair find(const double* values, std::size_t length, std::size_t n, std::size_t k) {
     const double aim = static_cast<double>(k) - 0.5;
-    double low = -INFINITE, missing = 0.0, next = -INFINITE;  // the bound below, and above it the next
+    double low = -INFINITE, missing = 0.0, next = -INFINITE;  // a bound, and above it the next
     double high = INFINITE, surplus = 0.0;
     double bound = at_ - step_, before = NaN, stride = step_;
     bool enclosed = false;
@@ -59,7 +60,7 @@ class Selection {
         step_ = enclosed ? step_ : step;
         enclosed = true;
       }
-      bound = std::max(std::min(bound, std::nextafter(high, -INFINITE)), next);
+      bound = std::max(bound < high ? bound : std::nextafter(high, -INFINITE), next);
     }
     return sorted(values, length, k);
   }
