@@ -14,6 +14,8 @@ from risaf_link.core.fusion import Epoch, FusionParameters, Mean, Median, quanti
 
 AGREEMENT = 1e-9  # rad/s
 FUSIONS = {"risaf": numpy_forms.Risaf, "mean": Mean, "median": Median}
+NUMPY = dict(FUSIONS)
+KERNEL = {"risaf": kernel.Risaf, "mean": kernel.Mean, "median": kernel.Median}
 
 
 @pytest.fixture(params=["numpy", "kernel"], autouse=True)
@@ -22,7 +24,8 @@ def _form(request, monkeypatch):
     if request.param == "kernel":
         if not kernel.BUILT:
             pytest.skip("no kernel was built: that takes a C++ compiler")
-        monkeypatch.setitem(FUSIONS, "risaf", kernel.Risaf)
+        for name, form in KERNEL.items():
+            monkeypatch.setitem(FUSIONS, name, form)
 
 
 # A coarse grid gives ties at the quantiles, as the counts of a real sensor do.
@@ -246,3 +249,96 @@ def test_the_fused_variance_is_that_of_one_sensor_not_of_their_mean():
     for method in ("mean", "median"):
         variance = fusion(method).fuse(epoch(rates)).variance
         assert np.sqrt(variance) == pytest.approx(0.01, rel=0.2)
+
+
+def normal(generator, n):
+    return generator.normal(0.0, 1e-3, (n, 3))
+
+
+def leaping(generator, n):
+    return normal(generator, n) + generator.choice([-40.0, -0.1, 0.02, 5.0])
+
+
+def heavy_tailed(generator, n):
+    return 1e-3 * generator.standard_cauchy((n, 3))
+
+
+def rising(generator, n):
+    return np.sort(normal(generator, n), axis=0)
+
+
+def falling(generator, n):
+    return -rising(generator, n)
+
+
+def one_sided(generator, n):
+    return np.where(np.arange(n)[:, np.newaxis] < n // 2, 30.0, normal(generator, n))
+
+
+def constant(generator, n):
+    return np.full((n, 3), generator.choice([0.0, 0.1, -1e-300]))
+
+
+def neighbouring(generator, n):
+    return 0.1 + np.spacing(0.1) * generator.integers(-3, 4, (n, 3))
+
+
+def counted(generator, n):
+    return np.rint(generator.normal(0.0, 2.0, (n, 3))) * 1e-3
+
+
+def gappy(generator, n):
+    return np.where(generator.random((n, 3)) < 0.4, np.nan, normal(generator, n))
+
+
+CONTINUOUS = [normal, leaping, heavy_tailed, rising, falling, one_sided, gappy]
+COARSE = [constant, neighbouring, counted]
+
+
+def sequences(kinds):
+    """Epochs of different kinds in any order, and their number of sensors, which may change."""
+    return st.lists(
+        st.tuples(st.sampled_from(kinds), st.sampled_from([1, 2, 3, 7, 8, 9, 150, 1000])),
+        min_size=1,
+        max_size=12,
+    )
+
+
+@given(sequences(CONTINUOUS + COARSE), st.integers(0, 99))
+def test_the_median_is_numpys_to_the_last_bit_whatever_came_before(sequence, seed):
+    generator, median = np.random.default_rng(seed), fusion("median")
+    for kind, n in sequence:
+        rates = kind(generator, n)
+        rates[0] = 0.05
+        assert (median.fuse(epoch(rates)).rate_b == np.nanquantile(rates, 0.5, axis=0)).all()
+
+
+@pytest.mark.parametrize("kind", CONTINUOUS + COARSE)
+def test_the_median_of_every_number_of_sensors_is_numpys_to_the_last_bit(kind):
+    generator, median = np.random.default_rng(3), fusion("median")
+    for n in range(1, 300):
+        rates = kind(generator, n)
+        rates[0] = 0.0
+        assert (median.fuse(epoch(rates)).rate_b == np.nanquantile(rates, 0.5, axis=0)).all()
+
+
+@pytest.mark.parametrize("method", FUSIONS)
+@given(sequence=sequences(CONTINUOUS), lower=st.floats(0, 0.5), seed=st.integers(0, 99))
+def test_the_kernel_does_what_the_numpy_form_says(method, sequence, lower, seed):
+    if not kernel.BUILT:
+        pytest.skip("no kernel was built: that takes a C++ compiler")
+    parameters = FusionParameters(lower_quantile=lower, upper_quantile=1.0 - lower / 2)
+    stated, done = NUMPY[method](parameters), KERNEL[method](parameters)
+    generator, largest = np.random.default_rng(seed), 0.0
+    for kind, n in sequence:
+        rates = kind(generator, n)
+        a, b = stated.fuse(epoch(rates)), done.fuse(epoch(rates))
+        assert (a.active.tolist(), a.valid) == (b.active.tolist(), b.valid)
+        # What rounds is as large as the readings have been: relative biases remember them.
+        largest = np.nanmax(np.abs(rates), initial=largest)
+        sizes = {"rate_b": largest, "variance": largest**2, "noise": largest**2, "bias_walk": 0.0}
+        for name, size in sizes.items():
+            x, y = getattr(a, name), getattr(b, name)
+            assert np.allclose(x, y, rtol=1e-12, atol=1e-12 * size, equal_nan=True)
+        for name in ("state", "reason", "rejected"):
+            assert (getattr(stated.health(), name) == getattr(done.health(), name)).all()

@@ -18,7 +18,7 @@ def watch(monitor, times, *valid, dt=DT):
     """Show epochs of one sensor for each argument: whether it has a valid reading."""
     rates = np.array([[0.0, 0.0, 0.0 if v else np.nan] for v in valid]).reshape(-1, 3)
     for _ in range(times):
-        monitor.watch(rates[np.newaxis], np.array([dt]))
+        monitor.watch(rates, dt)
     return monitor.health().state.tolist()
 
 
@@ -46,8 +46,7 @@ def test_a_sensor_that_never_spoke_is_dead_in_the_end(monitor):
 
 
 def test_one_axis_that_is_missing_or_infinite_makes_a_sensor_suspect(monitor):
-    rates = np.array([[0, 0, np.inf], [0, np.nan, 0], [0, 0, 0]])
-    monitor.watch(rates[np.newaxis], np.array([DT]))
+    monitor.watch(np.array([[0, 0, np.inf], [0, np.nan, 0], [0, 0, 0]]), DT)
     assert monitor.health().state.tolist() == [SUSPECT, SUSPECT, HEALTHY]
 
 

@@ -13,14 +13,7 @@ from msgspec import structs
 
 from risaf_link.core import kernel
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation, PaperFilter
-from risaf_link.core.fusion import (
-    Epoch,
-    FusedRate,
-    Fusion,
-    FusionParameters,
-    Mean,
-    Median,
-)
+from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion
 from risaf_link.core.rotation import Floats
@@ -29,8 +22,8 @@ from risaf_link.core.track import Track
 FUSIONS: dict[str, Callable[[FusionParameters], Fusion]] = {
     "robust": kernel.Robust,
     "risaf": kernel.Risaf,
-    "median": Median,
-    "mean": Mean,
+    "median": kernel.Median,
+    "mean": kernel.Mean,
 }
 FORCE_RESOLUTION = 0.02  # m/s^2; no accelerometer is blamed for less
 NO_FORCE = np.full(3, np.nan)

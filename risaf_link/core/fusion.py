@@ -141,7 +141,7 @@ class Risaf:
         """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
         p = self._parameters
         rates, valid = _channels(epoch)
-        self._silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
+        self._silence.watch(epoch.rates_b, epoch.dt)
         self._resize(rates.shape[1])
         mean = rates.sum(axis=1, where=valid) / np.maximum(valid.sum(axis=1), 1)
         residual = rates - mean[:, None]
@@ -176,7 +176,7 @@ class Mean:
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
         rates, valid = _channels(epoch)
-        self._silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
+        self._silence.watch(epoch.rates_b, epoch.dt)
         return _mean_of_active(self._parameters, epoch, rates, valid, valid)
 
     def health(self) -> ArrayHealth:
@@ -194,7 +194,7 @@ class Median:
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
         rates, valid = _channels(epoch)
-        self._silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
+        self._silence.watch(epoch.rates_b, epoch.dt)
         (median,) = quantiles(rates, (0.5,))
         (deviation,) = quantiles(np.abs(rates - median[:, None]), (0.5,))
         count = valid.sum(axis=1)

@@ -52,27 +52,25 @@ class SilenceMonitor:
     """
 
     def __init__(self) -> None:
-        self._elapsed = 0.0  # s
-        self._heard = np.zeros(0)  # s, when each sensor was last valid
+        self._silent_for = np.zeros(0)  # s, each sensor
 
-    def watch(self, rates: Floats, dt: Floats) -> None:
-        """Take note of the readings of k epochs, shape (k, n, 3), and the time of each, (k,) s."""
-        valid: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(rates), axis=2)
-        epochs, n = valid.shape
-        if not epochs:
-            return
-        if n != len(self._heard):
-            self._heard = np.full(n, np.nextafter(self._elapsed, -np.inf))
-        elapsed = np.cumsum(np.concatenate(([self._elapsed], dt)))
-        last = epochs - np.argmax(valid[::-1], axis=0)
-        self._heard = np.where(valid.any(axis=0), elapsed[last], self._heard)
-        self._elapsed = float(elapsed[-1])
+    def watch(self, rates: Floats, dt: float) -> None:
+        """Take note of the readings of one epoch, shape (n, 3)."""
+        valid: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(rates), axis=1)
+        if len(valid) != len(self._silent_for):
+            self._silent_for = np.zeros(len(valid))
+            dt = max(dt, np.finfo(float).tiny)
+        self._silent_for = np.where(valid, 0.0, self._silent_for + dt)
 
     def health(self, relative_bias: Floats | None = None) -> ArrayHealth:
         """Judge the sensors as of the last epoch; `relative_bias` (n, 3), rad/s."""
-        silent_for, n = self._elapsed - self._heard, len(self._heard)
-        silent = silent_for > 0.0
-        state = silent.astype(np.int8) + (silent_for > SILENT_AFTER)
-        bias = np.zeros((n, 3)) if relative_bias is None else relative_bias
-        reason = np.where(silent, Reason.SILENT, Reason.NONE).astype(np.int8)
-        return ArrayHealth(state.astype(np.int8), reason, np.zeros(n), bias)
+        return judge_silence(self._silent_for, relative_bias)
+
+
+def judge_silence(silent_for: Floats, relative_bias: Floats | None = None) -> ArrayHealth:
+    """Judge n sensors by for how long each has been silent, s; `relative_bias` (n, 3), rad/s."""
+    silent, n = silent_for > 0.0, len(silent_for)
+    state = silent.astype(np.int8) + (silent_for > SILENT_AFTER)
+    bias = np.zeros((n, 3)) if relative_bias is None else relative_bias
+    reason = np.where(silent, Reason.SILENT, Reason.NONE).astype(np.int8)
+    return ArrayHealth(state.astype(np.int8), reason, np.zeros(n), bias)

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
 from risaf_link.core import aiding, eskf, fusion, quaternion, robust
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState
 from risaf_link.core.eskf import USUAL_HEADING, Correction, Gravity, Outcome
-from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
+from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.heading import HeadingParameters
-from risaf_link.core.health import SILENT_AFTER, ArrayHealth, SilenceMonitor
+from risaf_link.core.health import SILENT_AFTER, ArrayHealth, judge_silence
 from risaf_link.core.rotation import Floats
 
 if TYPE_CHECKING:
@@ -35,6 +34,37 @@ _SHARED = (
 )
 
 
+class _Mean:
+    """`fusion.Mean` in C++."""
+
+    def __init__(self, parameters: FusionParameters) -> None:
+        self.kernel = _kernel.Mean(parameters.gyro_noise, parameters.bias_walk)
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return judge_silence(self.kernel.silent_for())
+
+    def fuse(self, epoch: Epoch) -> FusedRate:
+        """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
+        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
+
+
+class _Median:
+    """`fusion.Median` in C++."""
+
+    def __init__(self, parameters: FusionParameters) -> None:
+        p = parameters
+        self.kernel = _kernel.Median(p.gyro_noise, p.bias_walk, MAD_TO_STD)
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return judge_silence(self.kernel.silent_for())
+
+    def fuse(self, epoch: Epoch) -> FusedRate:
+        """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
+        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
+
+
 class _Risaf:
     """`fusion.Risaf` in C++."""
 
@@ -43,7 +73,6 @@ class _Risaf:
         self.kernel = _kernel.Risaf(
             p.alpha, p.lower_quantile, p.upper_quantile, p.gyro_noise, p.bias_walk
         )
-        self.silence = SilenceMonitor()
 
     @property
     def relative_bias(self) -> Floats:
@@ -52,12 +81,11 @@ class _Risaf:
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch, by their silence alone."""
-        return self.silence.health(self.relative_bias)
+        return judge_silence(self.kernel.silent_for(), self.relative_bias)
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
-        self.silence.watch(epoch.rates_b[np.newaxis], np.array([epoch.dt]))
-        return _fused(epoch.time_us, self.kernel.fuse(epoch.dt, epoch.rates_b))
+        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
 
 
 class _Robust:
@@ -89,11 +117,18 @@ class _Robust:
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
-        return self.fuse_readings(epoch.time_us, epoch.dt, epoch.rates_b)
+        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
 
     def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> FusedRate:
         """Fuse what sensors of one kind read at one instant, (n, 3)."""
-        return _fused(time_us, self.kernel.fuse(dt, readings))
+        return _fuse(self.kernel, time_us, dt, readings)
+
+
+def _fuse(kernel: "_kernel._Fusion", time_us: int, dt: float, readings: Floats) -> FusedRate:
+    values, active = np.empty((4, 3)), np.empty(3, np.int64)
+    valid = kernel.fuse(dt, readings, values, active)
+    rate, variance, noise, bias_walk = values
+    return FusedRate(time_us, rate, variance, active, valid, noise, bias_walk)
 
 
 _SOURCES = ("heading", "gravity", "size", "rest")
@@ -235,23 +270,18 @@ def advance(
     """
     if not (
         BUILT
-        and isinstance(gyros, _Robust | _Risaf)
+        and isinstance(gyros, _Mean | _Median | _Risaf | _Robust)
         and isinstance(accelerometers, _Robust)
         and isinstance(attitude, _Eskf)
         and isinstance(aid, _Aiding)
     ):
         return None
-    if isinstance(gyros, _Risaf):
-        gyros.silence.watch(rates_b, dt)
     filters = attitude.kernel, aid.kernel
     return _kernel.advance(gyros.kernel, accelerometers.kernel, *filters, dt, rates_b, forces_b)
 
 
-def _fused(time_us: int, parts: tuple[Floats, NDArray[np.int64], int]) -> FusedRate:
-    (rate, variance, noise, bias_walk), active, valid = parts
-    return FusedRate(time_us, rate, variance, active, valid, noise, bias_walk)
-
-
+Mean: Callable[[FusionParameters], Fusion] = _Mean if BUILT else fusion.Mean
+Median: Callable[[FusionParameters], Fusion] = _Median if BUILT else fusion.Median
 Risaf: Callable[[FusionParameters], Fusion] = _Risaf if BUILT else fusion.Risaf
 Robust = _Robust if BUILT else robust.Robust
 if TYPE_CHECKING or not BUILT:
@@ -260,4 +290,14 @@ if TYPE_CHECKING or not BUILT:
 else:
     Eskf, Aiding, SpeedTracker = _Eskf, _Aiding, _SpeedTracker
 
-__all__ = ["BUILT", "Aiding", "Eskf", "Risaf", "Robust", "SpeedTracker", "advance"]
+__all__ = [
+    "BUILT",
+    "Aiding",
+    "Eskf",
+    "Mean",
+    "Median",
+    "Risaf",
+    "Robust",
+    "SpeedTracker",
+    "advance",
+]

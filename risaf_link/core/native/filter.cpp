@@ -8,6 +8,8 @@
 #include "aiding.hpp"
 #include "eskf.hpp"
 #include "estimator.hpp"
+#include "mean.hpp"
+#include "median.hpp"
 #include "module.hpp"
 #include "risaf.hpp"
 #include "robust.hpp"
@@ -171,6 +173,8 @@ void bind_filter(nb::module_& m) {
         return told(aiding.take(filter, vector(rate_b), vector(force_b), dt));
       });
 
+  m.def("advance", &advance<risaf::Mean>);
+  m.def("advance", &advance<risaf::Median>);
   m.def("advance", &advance<risaf::Robust>);
   m.def("advance", &advance<risaf::Risaf>);
 }

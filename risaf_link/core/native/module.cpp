@@ -3,6 +3,8 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include "mean.hpp"
+#include "median.hpp"
 #include "module.hpp"
 #include "risaf.hpp"
 #include "robust.hpp"
@@ -12,32 +14,40 @@ using namespace nb::literals;
 namespace {
 
 using Readings = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Values = nb::ndarray<double, nb::shape<4, 3>, nb::c_contig, nb::device::cpu>;
+using Active = nb::ndarray<std::int64_t, nb::shape<3>, nb::c_contig, nb::device::cpu>;
+
+// Fuse into the caller's values (4, 3), rows as of FusedAxis, and active (3,); how many sensors are
+// valid on all axes.
 template <typename Fusion>
-nb::tuple fuse(Fusion& fusion, double dt, const Readings& readings) {
+std::int64_t fuse(Fusion& fusion, double dt, const Readings& readings, const Values& values,
+                  const Active& active) {
   risaf::FusedAxis fused[3];
   const std::int64_t valid = fusion.fuse(dt, readings.data(), readings.shape(0), fused);
-  auto* values = new double[12];
-  auto* active = new std::int64_t[3];
   for (std::size_t k = 0; k < 3; ++k) {
-    values[k] = fused[k].rate;
-    values[3 + k] = fused[k].variance;
-    values[6 + k] = fused[k].noise;
-    values[9 + k] = fused[k].bias_walk;
-    active[k] = fused[k].active;
+    values.data()[k] = fused[k].rate;
+    values.data()[3 + k] = fused[k].variance;
+    values.data()[6 + k] = fused[k].noise;
+    values.data()[9 + k] = fused[k].bias_walk;
+    active.data()[k] = fused[k].active;
   }
-  return nb::make_tuple(owned(values, {4, 3}), owned(active, {3}), valid);
+  return valid;
+}
+
+// The first n of each axis' row, shape (3, n).
+template <typename RowOf>
+Array<double> by_axis(std::size_t n, RowOf row) {
+  auto* values = new double[3 * n];
+  for (std::size_t k = 0; k < 3; ++k) {
+    std::copy_n(row(k).begin(), n, values + k * n);
+  }
+  return owned(values, {3, n});
 }
 
 // What is remembered of each channel under a name, shape (3, n).
-template <typename T>
-Array<double> channels(const risaf::Robust& robust, std::vector<T> risaf::Robust::Axis::*member) {
-  const std::size_t n = robust.sensors();
-  auto* values = new double[3 * n];
-  for (std::size_t k = 0; k < 3; ++k) {
-    const auto& channel = robust.axis(k).*member;
-    std::copy(channel.begin(), channel.end(), values + k * n);
-  }
-  return owned(values, {3, n});
+Array<double> channels(const risaf::Robust& robust, risaf::Row risaf::Robust::Axis::*member) {
+  return by_axis(robust.sensors(),
+                 [&](std::size_t k) -> const risaf::Row& { return robust.axis(k).*member; });
 }
 
 // All that is remembered, by the names of `Channels`.
@@ -63,22 +73,29 @@ nb::dict all_channels(const risaf::Robust& robust) {
 }
 
 Array<double> relative_bias(const risaf::Risaf& fusion) {
-  const std::size_t n = fusion.sensors();
-  auto* values = new double[3 * n];
-  for (std::size_t k = 0; k < 3; ++k) {
-    const auto& bias = fusion.relative_bias(k);
-    std::copy(bias.begin(), bias.end(), values + k * n);
-  }
-  return owned(values, {3, n});
+  return by_axis(fusion.readings().sensors,
+                 [&](std::size_t k) -> const risaf::Row& { return fusion.relative_bias(k); });
+}
+
+// For how long each sensor has been silent, shape (n,).
+template <typename Fusion>
+Array<double> silent_for(const Fusion& fusion) {
+  const std::size_t n = fusion.readings().sensors;
+  auto* values = new double[n];
+  std::copy_n(fusion.readings().silent_for.begin(), n, values);
+  return owned(values, {n});
+}
+
+// What every fusion can do.
+template <typename Fusion>
+nb::class_<Fusion> fusion(nb::module_& m, const char* name) {
+  return nb::class_<Fusion>(m, name).def("fuse", &fuse<Fusion>, "dt"_a, "readings"_a,
+                                         "values"_a.noconvert(), "active"_a.noconvert());
 }
 
 }  // namespace
 
-void bind_frames(nb::module_& m);
-
 NB_MODULE(_kernel, m) {
-  bind_frames(m);
-
   nb::class_<risaf::RobustParameters> parameters(m, "RobustParameters");
   parameters.def(nb::init<>());
   const auto field = [&parameters](const char* name, double risaf::RobustParameters::*member) {
@@ -107,19 +124,24 @@ NB_MODULE(_kernel, m) {
   field("prior", &risaf::RobustParameters::prior);
   parameters.def_rw("mad_factors", &risaf::RobustParameters::mad_factors);
 
-  nb::class_<risaf::Risaf>(m, "Risaf")
+  fusion<risaf::Mean>(m, "Mean")
+      .def(nb::init<double, double>(), "gyro_noise"_a, "bias_walk"_a)
+      .def("silent_for", &silent_for<risaf::Mean>);
+  fusion<risaf::Median>(m, "Median")
+      .def(nb::init<double, double, double>(), "gyro_noise"_a, "bias_walk"_a, "mad_to_std"_a)
+      .def("silent_for", &silent_for<risaf::Median>);
+  fusion<risaf::Risaf>(m, "Risaf")
       .def(nb::init<double, double, double, double, double>(), "alpha"_a, "lower_quantile"_a,
            "upper_quantile"_a, "gyro_noise"_a, "bias_walk"_a)
-      .def("fuse", &fuse<risaf::Risaf>, "dt"_a, "readings"_a)
+      .def("silent_for", &silent_for<risaf::Risaf>)
       .def("relative_bias", &relative_bias);
-
-  nb::class_<risaf::Robust>(m, "Robust")
+  fusion<risaf::Robust>(m, "Robust")
       .def(nb::init<risaf::RobustParameters>())
-      .def("fuse", &fuse<risaf::Robust>, "dt"_a, "readings"_a)
       .def("channels", &all_channels)
       .def("trusted", [](const risaf::Robust& robust) {
         return channels(robust, &risaf::Robust::Axis::trusted);
       });
 
   bind_filter(m);
+  bind_frames(m);
 }

@@ -20,3 +20,4 @@ Array<T> owned(T* values, std::initializer_list<std::size_t> shape) {
 }
 
 void bind_filter(nb::module_& m);
+void bind_frames(nb::module_& m);

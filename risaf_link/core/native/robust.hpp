@@ -6,9 +6,11 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "fused.hpp"
+#include "row.hpp"
 #include "select.hpp"
 
 namespace risaf {
@@ -25,80 +27,85 @@ class Robust {
  public:
   explicit Robust(RobustParameters parameters) : p(std::move(parameters)) {}
 
-  // Channels of one axis, each of n values; as `Channels` of robust.py.
+  // Channels of one axis; as `Channels` of robust.py.
   struct Axis {
-    std::vector<double> reading, count, residual, bias, age, slow, rejected, unchanged, moved;
-    std::vector<double> silent, calm, out;
-    std::vector<std::uint8_t> frozen, wandering, outlying, trusted;
+    Row reading, count, residual, bias, age, slow, rejected, unchanged, moved;
+    Row frozen, silent, calm, out, wandering, outlying, trusted;
     double spread = 0.0, slow_spread = 0.0, centre = 0.0, turning = 0.0, jitter = 0.0;
     double calm_walk = 0.0, noise = NaN;
     // Of this epoch.
-    std::vector<double> corrected, offset;
-    std::vector<std::uint8_t> valid, changing, jury, inside, active;
-    std::size_t jury_count = 0, valid_count = 0, changing_count = 0, active_count = 0;
-    double mean = 0.0;
-
-    void resize(std::size_t n, const RobustParameters& p, bool first) {
-      const std::size_t known = reading.size();
-      reading.resize(n, NaN);
-      count.resize(n, NaN);
-      for (auto* values : {&residual, &bias, &age, &slow, &rejected, &unchanged, &moved, &silent}) {
-        values->resize(n, 0.0);
-      }
-      calm.resize(n, first ? p.hold_time : 0.0);
-      out.resize(n, first ? 0.0 : p.relearn);
-      for (auto* flags : {&frozen, &wandering, &outlying, &trusted, &valid, &changing, &jury, &inside, &active}) {
-        flags->resize(n, 0);
-      }
-      corrected.resize(n);
-      offset.resize(n);
-      for (std::size_t i = known; i < n; ++i) {
-        trusted[i] = calm[i] >= p.hold_time;
-      }
-    }
+    Row now, offset, valid, changing, jury, inside, active;
+    std::size_t jury_count = 0, changing_count = 0, active_count = 0, moved_count = 0;
+    double now_spread = 0.0, nearest = 0.0, mean = 0.0, slow_centre = 0.0;
+    Selection centres, spreads, slow_centres, slow_spreads;
   };
 
   std::size_t sensors() const { return n_; }
   const Axis& axis(std::size_t i) const { return axes_[i]; }
 
   // Fuse readings (n, 3); returns how many sensors are valid on all axes.
-  std::int64_t fuse(double dt, const double* readings, std::size_t n, FusedAxis* fused) {
+  RISAF_FAST std::int64_t fuse(double dt, const double* readings, std::size_t n, FusedAxis* fused) {
     dt = dt > 0.0 && n_ > 0 ? std::min(dt, p.longest) : 0.0;
     if (n != n_) {
-      for (Axis& a : axes_) {
-        a.resize(n, p, n_ == 0);
-      }
-      scratch_.resize(n);
-      n_ = n;
+      resize(n);
     }
     elapsed_ += dt;
-    for (std::size_t k = 0; k < 3; ++k) {
-      Axis& a = axes_[k];
-      note_changes(a, readings + k, dt);
+    by_axis(readings, n, axes_[0].now.data(), axes_[1].now.data(), axes_[2].now.data());
+    for (Axis& a : axes_) {
+      note_changes(a, dt);
       choose_jury(a);
       find_centre(a, dt);
     }
-    const double least = std::hypot(p.resolution, unscaled(axes_[0].centre, axes_[1].centre, axes_[2].centre));
+    const double least = std::hypot(
+        p.resolution, unscaled(axes_[0].centre, axes_[1].centre, axes_[2].centre));
     const double least_slow = std::hypot(
         p.resolution, p.gate * unscaled(axes_[0].turning, axes_[1].turning, axes_[2].turning));
-    std::array<std::size_t, 3> moved{};
-    for (std::size_t k = 0; k < 3; ++k) {
-      Axis& a = axes_[k];
+    for (Axis& a : axes_) {
       choose_active(a, limit(a, least, dt));
+      follow(a, dt);
       average_noise(a, dt);
-      learn(a, dt);
-      watch(a, least_slow, dt);
-      moved[k] = trust(a, dt);
+      trust(a, slow_limit(a, least_slow, dt), dt);
     }
-    judge(dt, moved, fused);
-    std::int64_t whole = 0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      whole += axes_[0].valid[i] & axes_[1].valid[i] & axes_[2].valid[i];
-    }
-    return whole;
+    judge(dt, fused);
+    return static_cast<std::int64_t>(risaf::count(length(), [this](std::size_t i) {
+      return axes_[0].valid[i] * axes_[1].valid[i] * axes_[2].valid[i] > 0.0;
+    }));
   }
 
  private:
+  // Keep the first n sensors, and make new ones of which nothing is known.
+  [[gnu::noinline]] void resize(std::size_t n) {
+    const std::size_t kept = std::min(n, n_), length = padded(n);
+    const bool first = n_ == 0;
+    for (Axis& a : axes_) {
+      const auto fill = [=](Row& row, double value) {
+        row.resize(kept);
+        row.resize(length, value);
+      };
+      fill(a.reading, NaN);
+      fill(a.count, NaN);
+      for (Row* row : {&a.residual, &a.bias, &a.age, &a.slow, &a.rejected, &a.unchanged, &a.moved,
+                       &a.frozen, &a.silent, &a.wandering, &a.outlying}) {
+        fill(*row, 0.0);
+      }
+      fill(a.calm, first ? p.hold_time : 0.0);
+      fill(a.out, first ? 0.0 : p.relearn);
+      a.trusted.resize(length);
+      for (std::size_t i = 0; i < length; ++i) {
+        a.trusted[i] = a.calm[i] >= p.hold_time && i < n ? 1.0 : 0.0;
+      }
+      for (std::size_t i = n; i < length; ++i) {
+        a.silent[i] = INFINITE;  // no sensor, and so never trusted
+      }
+      for (Row* row : {&a.now, &a.offset, &a.valid, &a.changing, &a.jury, &a.inside, &a.active}) {
+        row->assign(length, NaN);
+      }
+    }
+    values_.resize(length);
+    n_ = n;
+    blocks_ = length / PARTS;
+  }
+
   double unscaled(double x, double y, double z) const {
     const double believed = p.prior / (p.prior + static_cast<double>(n_));
     return p.scale_error * std::sqrt(believed * (x * x + y * y + z * z));
@@ -108,189 +115,167 @@ class Robust {
     return elapsed_ > 0.0 ? dt / std::min(elapsed_, time_constant) : 1.0;
   }
 
-  double factor(std::size_t count) const {
-    return p.mad_factors[std::min(count, p.mad_factors.size() - 1)];
+  // Robust standard deviation, from the median of the distances of so many.
+  double deviation(std::size_t count, double median) const {
+    return p.mad_factors[std::min(count, p.mad_factors.size() - 1)] * median;
   }
 
-  void note_changes(Axis& a, const double* readings, double dt) {
-    a.valid_count = a.changing_count = 0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      const double reading = readings[3 * i];
-      const bool valid = std::abs(reading) < p.limit;
-      const double change = std::abs(reading - a.reading[i]);
-      const bool changed = valid && change > 0.0;
-      if (changed) {
-        a.count[i] = std::fmin(a.count[i], change);
-        a.unchanged[i] = 0.0;
-      } else if (valid) {
-        a.unchanged[i] += dt;
-      }
-      a.silent[i] = valid ? 0.0 : a.silent[i] + dt;
-      if (valid) {
-        a.reading[i] = reading;
-      }
-      const double count = std::fmax(a.count[i], p.resolution);
-      const bool reason = std::abs(a.moved[i]) > 2.0 * count || 2.0 * a.jitter > count || a.frozen[i];
-      a.frozen[i] = valid && a.unchanged[i] > p.frozen_after && reason;
-      a.valid[i] = valid;
-      a.changing[i] = valid && !a.frozen[i];
-      a.corrected[i] = valid ? reading - a.bias[i] : 0.0;
-      a.valid_count += valid;
-      a.changing_count += a.changing[i];
+  void note_changes(Axis& a, double dt) {
+    const double limit = p.limit, resolution = p.resolution, frozen_after = p.frozen_after;
+    const double jitter = a.jitter;
+    RISAF_EACH
+    for (std::size_t i = 0; i < length(); ++i) {
+      const double reading = a.now[i], change = std::abs(reading - a.reading[i]);
+      const bool valid = std::abs(reading) < limit;
+      const bool changed = valid & (change > 0.0);  // false for the first
+      a.count[i] = minimum(a.count[i], where(changed, change, a.count[i]));
+      a.unchanged[i] = where(changed, 0.0, a.unchanged[i] + where(valid, dt, 0.0));
+      a.silent[i] = where(valid, 0.0, a.silent[i] + dt);
+      a.reading[i] = where(valid, reading, a.reading[i]);
+      const double count = maximum(a.count[i], resolution);
+      const bool reason =
+          (std::abs(a.moved[i]) > 2.0 * count) | (2.0 * jitter > count) | (a.frozen[i] > 0.0);
+      const bool frozen = valid & (a.unchanged[i] > frozen_after) & reason;
+      a.frozen[i] = where(frozen, 1.0, 0.0);
+      a.valid[i] = where(valid, 1.0, 0.0);
+      a.changing[i] = where(valid & !frozen, 1.0, 0.0);
+      a.jury[i] = a.changing[i] * a.trusted[i];
+      a.offset[i] = where(valid, reading, a.bias[i]) - a.bias[i];
     }
   }
 
   void choose_jury(Axis& a) {
-    std::size_t trusted = 0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      a.jury[i] = a.trusted[i] & a.changing[i];
-      trusted += a.jury[i];
-    }
-    a.jury_count = trusted;
-    if (static_cast<double>(trusted) < std::max(3.0, static_cast<double>(a.valid_count) / 2.0)) {
+    const std::size_t valid = flagged(a.valid);
+    a.changing_count = flagged(a.changing);
+    a.jury_count = flagged(a.jury);
+    if (static_cast<double>(a.jury_count) < std::max(3.0, static_cast<double>(valid) / 2.0)) {
       a.jury = a.changing_count ? a.changing : a.valid;
-      a.jury_count = a.changing_count ? a.changing_count : a.valid_count;
+      a.jury_count = a.changing_count ? a.changing_count : valid;
     }
   }
 
   void find_centre(Axis& a, double dt) {
-    const double centre = median_of(a.corrected.data(), a.jury.data());
-    for (std::size_t i = 0; i < n_; ++i) {
-      a.moved[i] = a.unchanged[i] > 0.0 ? a.moved[i] + (centre - a.centre) : 0.0;
-      a.offset[i] = a.corrected[i] - centre;
+    select(a.offset, a.jury);
+    const double centre = a.centres.median(values_.data(), length(), a.jury_count);
+    const double step = centre - a.centre;
+    RISAF_EACH
+    for (std::size_t i = 0; i < length(); ++i) {
+      a.moved[i] = where(a.unchanged[i] > 0.0, a.moved[i] + step, 0.0);
+      a.offset[i] -= centre;
+      values_[i] = where(a.jury[i] > 0.0, std::abs(a.offset[i]), INFINITE);
     }
+    const std::size_t n = a.jury_count;
+    a.nearest = least(length(), [this](std::size_t i) { return values_[i]; });
+    a.now_spread = deviation(n, a.spreads.median(values_.data(), length(), n));
     a.centre = centre;
     a.turning += dt / p.watch_time * (centre - a.turning);
   }
 
-  double median_of(const double* values, const std::uint8_t* chosen) {
-    std::size_t m = 0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      scratch_[m] = values[i];
-      m += chosen[i];
-    }
-    return median(scratch_.data(), m);
-  }
-
   double limit(Axis& a, double least, double dt) {
     const double usual = std::max(a.spread, least);
-    double nearest = INFINITE;
-    std::size_t m = 0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      const double distance = std::abs(a.offset[i]);
-      scratch_[m] = distance;
-      m += a.jury[i];
-      nearest = a.jury[i] ? std::min(nearest, distance) : nearest;
-    }
-    double spread = factor(m) * median(scratch_.data(), m);
+    double spread = a.now_spread;
     if (elapsed_ > 0.0) {
       spread = std::min(spread, p.swell * usual);
     }
     a.spread += share(dt, p.noise_time) * (spread - a.spread);
-    return std::max(p.gate * std::max({spread, a.spread, least}), nearest);
+    return std::max(p.gate * std::max({spread, a.spread, least}), a.nearest);
   }
 
   void choose_active(Axis& a, double limit) {
-    std::size_t count = 0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      a.inside[i] = (std::abs(a.offset[i]) <= limit) & a.valid[i];
-      a.active[i] = a.trusted[i] & a.changing[i] & a.inside[i];
-      count += a.active[i];
+    RISAF_EACH
+    for (std::size_t i = 0; i < length(); ++i) {
+      a.inside[i] = where(std::abs(a.offset[i]) <= limit, a.valid[i], 0.0);
+      a.active[i] = a.trusted[i] * a.changing[i] * a.inside[i];
     }
-    if (count == 0) {
-      for (std::size_t i = 0; i < n_; ++i) {
-        a.active[i] = a.jury[i] & a.inside[i];
-        count += a.active[i];
+    a.active_count = flagged(a.active);
+    if (a.active_count == 0) {  // where none of the trusted is inside, the rest of the jury
+      RISAF_EACH
+      for (std::size_t i = 0; i < length(); ++i) {
+        a.active[i] = a.jury[i] * a.inside[i];
       }
+      a.active_count = flagged(a.active);
     }
-    double sum = 0.0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      sum += a.active[i] ? a.offset[i] : 0.0;
-    }
-    a.active_count = count;
-    a.mean = sum / static_cast<double>(std::max<std::size_t>(count, 1));
+    a.mean = sum(length(), [&a](std::size_t i) { return a.offset[i] * a.active[i]; }) /
+             static_cast<double>(std::max<std::size_t>(a.active_count, 1));
   }
 
-  void average_noise(Axis& a, double dt) {
-    double square = 0.0, change_square = 0.0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      const double residual = a.active[i] ? a.offset[i] - a.mean : 0.0;
-      const double change = residual - a.residual[i];
-      a.residual[i] = residual;
-      square += residual * residual;
-      change_square += change * change;
+  // Let biases, residuals and what watches them follow the readings.
+  void follow(Axis& a, double dt) {
+    const double by_watch = dt / p.watch_time, by_burst = dt / p.burst_time, mean = a.mean;
+    const double relearn = p.relearn, tiny = p.tiny, bias_time = p.bias_time;
+    RISAF_EACH
+    for (std::size_t i = 0; i < length(); ++i) {
+      const double residual = a.offset[i] - mean, used = a.active[i] * residual;
+      values_[i] = used - a.residual[i];
+      a.residual[i] = used;
+      const double known = a.trusted[i] * a.active[i];
+      const double anew = where(a.out[i] >= relearn, a.changing[i], 0.0);
+      const double elapsed = maximum(known, anew) * dt;
+      a.age[i] += elapsed;
+      a.bias[i] += elapsed / minimum(maximum(a.age[i], tiny), bias_time) * residual;
+      a.slow[i] += by_watch * (a.inside[i] * residual - a.slow[i]);
+      a.rejected[i] += by_burst * (a.valid[i] - a.inside[i] - a.rejected[i]);
     }
+  }
+
+  // Of the changes of the residuals in `values_`, and of the residuals.
+  void average_noise(Axis& a, double dt) {
     const auto count = static_cast<double>(a.active_count);
     if (a.active_count > 1) {
-      square /= count - 1.0;
+      const double square = sum_of_squares(a.residual) / (count - 1.0);
       const double known = std::isnan(a.noise) ? square : a.noise;
       a.noise = known + share(dt, p.noise_time) * (square - known);
     }
-    const double size = std::sqrt(change_square / std::max(2.0 * count, 1.0));
+    const double size = std::sqrt(sum_of_squares(values_) / std::max(2.0 * count, 1.0));
     a.jitter += share(dt, p.spread_time) * (size - a.jitter);
   }
 
-  void learn(Axis& a, double dt) {
-    for (std::size_t i = 0; i < n_; ++i) {
-      const bool learning =
-          (a.trusted[i] & a.active[i]) || (a.out[i] >= p.relearn && a.changing[i]);
-      const double elapsed = learning ? dt : 0.0;
-      a.age[i] += elapsed;
-      const double time = std::min(std::max(a.age[i], p.tiny), p.bias_time);
-      a.bias[i] += elapsed / time * (a.offset[i] - a.mean);
-    }
-  }
-
-  void watch(Axis& a, double least, double dt) {
-    const double by_watch = dt / p.watch_time, by_burst = dt / p.burst_time;
-    for (std::size_t i = 0; i < n_; ++i) {
-      const double residual = a.inside[i] ? a.offset[i] - a.mean : 0.0;
-      const double rejected = a.valid[i] && !a.inside[i] ? 1.0 : 0.0;
-      a.slow[i] += by_watch * (residual - a.slow[i]);
-      a.rejected[i] += by_burst * (rejected - a.rejected[i]);
-    }
-    const double centre = median_of(a.slow.data(), a.changing.data());
-    std::size_t m = 0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      scratch_[m] = std::abs(a.slow[i] - centre);
-      m += a.changing[i];
+  // How far from their centre z may be.
+  double slow_limit(Axis& a, double least, double dt) {
+    const std::size_t n = a.changing_count;
+    select(a.slow, a.changing);
+    a.slow_centre = a.slow_centres.median(values_.data(), length(), n);
+    const double centre = a.slow_centre;
+    RISAF_EACH
+    for (std::size_t i = 0; i < length(); ++i) {
+      values_[i] = where(a.changing[i] > 0.0, std::abs(a.slow[i] - centre), INFINITE);
     }
     const double white = a.spread * std::sqrt(dt / (2.0 * p.watch_time));
-    const double spread = std::max(factor(m) * median(scratch_.data(), m), white);
+    const double spread =
+        std::max(deviation(n, a.slow_spreads.median(values_.data(), length(), n)), white);
     a.slow_spread += share(dt, p.spread_time) * (spread - a.slow_spread);
-    const double limit = std::max(p.gate * std::max(spread, a.slow_spread), least);
-    for (std::size_t i = 0; i < n_; ++i) {
-      a.wandering[i] = std::abs(a.slow[i] - centre) > limit;
-    }
+    return std::max(p.gate * std::max(spread, a.slow_spread), least);
   }
 
-  // How many channels have come or gone.
-  std::size_t trust(Axis& a, double dt) {
-    std::size_t moved = 0, trusting = 0;
-    double usual = 0.0;
-    for (std::size_t i = 0; i < n_; ++i) {
-      usual += a.trusted[i] ? a.rejected[i] : 0.0;
-      trusting += a.trusted[i];
+  void trust(Axis& a, double slow_limit, double dt) {
+    const std::size_t trusting = flagged(a.trusted);
+    const double sum_of_shares =
+        sum(length(), [&a](std::size_t i) { return a.rejected[i] * a.trusted[i]; });
+    const double usual = sum_of_shares / static_cast<double>(std::max<std::size_t>(trusting, 1));
+    const double burst = usual + p.burst, silent_after = p.silent_after, hold_time = p.hold_time;
+    const double relearn = p.relearn, centre = a.slow_centre;
+    RISAF_EACH
+    for (std::size_t i = 0; i < length(); ++i) {
+      const bool outlying = a.rejected[i] > burst;
+      const bool wandering = std::abs(a.slow[i] - centre) > slow_limit;
+      const bool alarm = outlying | wandering | (a.frozen[i] > 0.0) | (a.silent[i] > silent_after);
+      a.calm[i] = where(alarm, 0.0, a.calm[i] + dt);
+      const bool trusted = a.calm[i] >= hold_time;
+      const double now = where(trusted, 1.0, 0.0);
+      a.out[i] = where(trusted, 0.0, a.out[i] + dt);
+      const bool anew =
+          (a.out[i] >= relearn) & ((a.out[i] < relearn + dt) | (a.age[i] >= relearn));
+      a.age[i] = where(anew, 0.0, a.age[i]);
+      a.slow[i] = where(anew, 0.0, a.slow[i]);
+      a.outlying[i] = where(outlying, 1.0, 0.0);
+      a.wandering[i] = where(wandering, 1.0, 0.0);
+      values_[i] = std::abs(a.trusted[i] - now);
+      a.trusted[i] = now;
     }
-    usual /= static_cast<double>(std::max<std::size_t>(trusting, 1));
-    for (std::size_t i = 0; i < n_; ++i) {
-      a.outlying[i] = a.rejected[i] > usual + p.burst;
-      const bool alarm = a.outlying[i] || a.wandering[i] || a.frozen[i] ||
-                         a.silent[i] > p.silent_after;
-      a.calm[i] = alarm ? 0.0 : a.calm[i] + dt;
-      const bool trusted = a.calm[i] >= p.hold_time;
-      a.out[i] = trusted ? 0.0 : a.out[i] + dt;
-      if (a.out[i] >= p.relearn && (a.out[i] < p.relearn + dt || a.age[i] >= p.relearn)) {
-        a.age[i] = 0.0;
-        a.slow[i] = 0.0;
-      }
-      moved += trusted != static_cast<bool>(a.trusted[i]);
-      a.trusted[i] = trusted;
-    }
-    return moved;
+    a.moved_count = flagged(values_);
   }
 
-  void judge(double dt, const std::array<std::size_t, 3>& moved, FusedAxis* fused) {
+  void judge(double dt, FusedAxis* fused) {
     const double time = std::min(std::max(2.0 / 3.0 * elapsed_, p.watch_time), p.bias_time);
     double turned = 0.0;
     for (const Axis& a : axes_) {
@@ -304,10 +289,8 @@ class Robust {
     for (std::size_t k = 0; k < 3; ++k) {
       Axis& a = axes_[k];
       const double count = a.active_count ? static_cast<double>(a.active_count) : NaN;
-      double slow = 0.0;
-      for (std::size_t i = 0; i < n_; ++i) {
-        slow += a.active[i] ? a.slow[i] * a.slow[i] : 0.0;
-      }
+      double slow =
+          sum(length(), [&a](std::size_t i) { return a.active[i] * a.slow[i] * a.slow[i]; });
       slow = a.active_count ? slow / std::max(count - 1.0, 1.0) : NaN;
       double white = a.noise - slow;
       white = std::isnan(white) ? NaN : std::max(white, p.least_white * a.noise);
@@ -317,8 +300,8 @@ class Robust {
       walk = a.calm_walk / std::max(calm_, p.tiny);
       const double told = count - 1.0;
       walk = (p.prior * p.bias_walk * p.bias_walk + told * std::max(walk, 0.0)) / (p.prior + told);
-      if (dt > 0.0 && moved[k]) {
-        walk += static_cast<double>(moved[k]) / (count * dt) * slow;
+      if (dt > 0.0 && a.moved_count) {
+        walk += static_cast<double>(a.moved_count) / (count * dt) * slow;
       }
       const double alone = dt > 0.0 ? p.gyro_noise * p.gyro_noise / dt : NaN;
       fused[k].active = static_cast<std::int64_t>(a.active_count);
@@ -329,10 +312,29 @@ class Robust {
     }
   }
 
+  // Of the rows.
+  std::size_t length() const { return PARTS * blocks_; }
+
+  std::size_t flagged(const Row& flags) const {
+    return risaf::count(length(), [&flags](std::size_t i) { return flags[i] > 0.0; });
+  }
+
+  double sum_of_squares(const Row& row) const {
+    return sum(length(), [&row](std::size_t i) { return row[i] * row[i]; });
+  }
+
+  // The chosen of a row in `values_`; the others are infinite there.
+  void select(const Row& row, const Row& chosen) {
+    RISAF_EACH
+    for (std::size_t i = 0; i < length(); ++i) {
+      values_[i] = where(chosen[i] > 0.0, row[i], INFINITE);
+    }
+  }
+
   RobustParameters p;
   std::array<Axis, 3> axes_;
-  std::vector<double> scratch_;
-  std::size_t n_ = 0;
+  Row values_;  // on their way to a median or a sum
+  std::size_t n_ = 0, blocks_ = 0;
   double elapsed_ = 0.0, calm_ = 0.0;
 };
 
