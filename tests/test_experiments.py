@@ -22,7 +22,7 @@ from risaf_link.experiments.case import Case
 from risaf_link.experiments.cost import Timing, exponent
 from risaf_link.experiments.report import Section, Setting, page, rmses, spread
 from risaf_link.experiments.run import EXPERIMENTS
-from risaf_link.experiments.sweep import Sweep
+from risaf_link.sweep import Sweep
 
 
 def cases(seeds=3):
@@ -146,7 +146,7 @@ def tiny(monkeypatch):
     short = replace(drives.DRIVES["circle"], quick=(8.0, (4.0, 8.0)))
     monkeypatch.setitem(drives.DRIVES, "circle", short)
     monkeypatch.setattr("risaf_link.experiments.drives.QUICK_SENSORS", 4)
-    monkeypatch.setattr("risaf_link.experiments.sweep._on_cores", in_process)
+    monkeypatch.setattr("risaf_link.sweep._on_cores", in_process)
 
 
 def in_process(cases, _):

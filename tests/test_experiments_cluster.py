@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from risaf_link.errors import ConfigError
 from risaf_link.experiments.case import Case
-from risaf_link.experiments.sweep import Sweep
+from risaf_link.sweep import Sweep
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("ignore")  # what Dask itself warns of is not ours
@@ -50,7 +50,7 @@ def test_a_sweep_is_complete_though_a_worker_is_killed(tmp_path, cluster):
 
 
 def test_a_scheduler_that_is_not_there_is_told_in_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("risaf_link.experiments.sweep.PATIENCE", 0.2)
+    monkeypatch.setattr("risaf_link.sweep.PATIENCE", 0.2)
     with pytest.raises(ConfigError, match="no scheduler answers") as told:
         Sweep(tmp_path, cluster="tcp://127.0.0.1:9").run([Mortal(str(tmp_path / "mark"))], "")
     assert "\n" not in str(told.value)

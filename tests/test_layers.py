@@ -12,7 +12,7 @@ LAYERS = [
     {"mavlink"},
     {"pipeline"},
     {"links", "publish", "sim"},
-    {"config"},
+    {"config", "sweep"},
     {"service", "replay", "survey", "calibrate", "experiments"},
     {"words"},
     {"cli"},

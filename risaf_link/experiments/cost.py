@@ -17,7 +17,7 @@ from risaf_link.experiments.catalogue import METHODS, make, titles
 from risaf_link.experiments.figures import colour, figure, legend
 from risaf_link.experiments.method import ArrayModel
 from risaf_link.experiments.report import Section, Setting, write
-from risaf_link.experiments.sweep import Row
+from risaf_link.sweep import Row
 
 SENSORS = (3, 10, 30, 100, 150, 300, 1000)
 FITTED_FROM = 100  # sensors; below, what does not depend on them counts
