@@ -73,11 +73,20 @@ def test_other_parameters_are_another_case():
     assert len(keys) == 6
 
 
-def test_a_worker_that_dies_is_told_and_what_was_finished_stays(tmp_path):
-    Sweep(tmp_path, workers=1).run(cases(1), "")
-    with pytest.raises(RisafError, match="a worker process died"):
-        Sweep(tmp_path, workers=1).run([*cases(1), Deadly()], "")
-    assert len(list(tmp_path.glob("*.json"))) == 1
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_case_that_kills_its_workers_is_told_and_costs_only_itself(tmp_path, workers):
+    work = [Deadly(), *cases(3)]
+
+    def told(case, error):
+        return {"key": case.key, "error": str(error)}
+
+    lost, *others = Sweep(tmp_path, workers).run(work, "", failed=told)
+    assert lost["key"] == "deadly"
+    assert "every worker process that ran it died" in lost["error"]
+    assert others == [case.run() for case in cases(3)]
+    with pytest.raises(RisafError, match="deadly: every worker process that ran it died"):
+        Sweep(tmp_path, workers).run(work, "")
+    assert len(list(tmp_path.glob("*.json"))) == 3
 
 
 def test_white_noise_is_read_off_as_angle_random_walk():
