@@ -14,7 +14,7 @@ LAYERS = [
     {"links", "publish", "sim"},
     {"config", "sweep"},
     {"service", "replay", "survey", "calibrate", "experiments"},
-    {"words"},
+    {"fleet", "words"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
