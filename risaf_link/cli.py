@@ -73,6 +73,20 @@ def _configured(command: Command) -> Command:
     return file(setting(command))
 
 
+def _spread(command: Command) -> Command:
+    """Add the options that say where many cases run."""
+    workers = click.option(
+        "--workers",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Processes.  [default: all cores]",
+    )
+    cluster = click.option(
+        "--cluster", metavar="ADDRESS", help="A Dask scheduler (needs the extra `cluster`)."
+    )
+    return workers(cluster(command))
+
+
 def _selected(command: Command) -> Command:
     """Add the options that choose a part of a log."""
     end = click.option(
@@ -129,13 +143,13 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
 
 
 @main.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @_configured
 @click.option(
     "--speed",
     type=click.FloatRange(min=0, min_open=True),
     metavar="N",
-    help="Times real time.  [default: as fast as it goes]",
+    help="Times real time, of one log.  [default: as fast as it goes]",
 )
 @_selected
 @click.option(
@@ -150,50 +164,50 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
     "--out",
     type=click.Path(path_type=Path),
     metavar="OUT.tlog",
-    help="Write what the service would have sent.",
+    help="Write what the service would have sent, of one log.",
 )
 @click.option(
     "--csv",
     type=click.Path(path_type=Path),
-    metavar="OUT.csv",
-    help="Write one row an epoch; rad, rad/s.",
+    metavar="OUT.csv|DIR",
+    help="Write one row an epoch; rad, rad/s. Of many logs: one file each into a directory.",
 )
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
     metavar="OUT.png",
-    help="Draw heading and error (needs the extra `plot`).",
+    help="Draw heading and error of one log (needs the extra `plot`).",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
-def replay(log: Path, config_path: Path | None, settings: tuple[str, ...], **options: Any) -> None:
-    """Send a tlog through the pipeline and score its heading.
+@click.option(
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print the summary as one JSON object; of many logs, a list of them.",
+)
+@_spread
+def replay(
+    logs: tuple[Path, ...], config_path: Path | None, settings: tuple[str, ...], **options: Any
+) -> None:
+    """Send tlogs through the pipeline and score their heading.
 
     Outages of GPS that the log has are found; more can be made with --outage. Headings are scored
     against the truth where the log carries it (SITL, simulate), and against GPS that was withheld.
 
+    Many logs (or one with --workers or --cluster) are spread over all cores, or over the workers of
+    a cluster, which need the same files at the same paths. One that cannot be used says why in its
+    row; the others go on, and the exit status is 3. A CSV bears the name of its log, with as many
+    directories before it as tell it from the others. With --csv, what was finished when it was
+    interrupted is not done again, unless log, options, configuration or program have changed.
+
     \b
     risaf-link replay drive.tlog --out estimate.tlog --csv estimate.csv
     risaf-link replay drive.tlog --outage 100:300 --set fusion.method=mean --json
+    risaf-link replay night/*/*.tlog --csv tables --cluster tcp://10.0.0.1:8786
     """
-    from risaf_link.config import load
-    from risaf_link.replay import Replay, Selection
-    from risaf_link.words import summary_text
-
-    config = load(config_path, settings)
-    selection = Selection(options["start"], options["end"], options["outages"])
-    replayed = Replay(config, log, selection, keep_trace=bool(options["plot"]))
-    plot = _plot(options["plot"])
-    with ExitStack() as files, _progress(log) as progress:
-        sinks = _sinks(config, options, files)
-        for received_us, estimate in replayed.estimates(progress):
-            for sink in sinks:
-                sink(received_us, estimate)
-            if plot:
-                plot.take(estimate)
-    if plot:
-        plot.draw(options["plot"], log.name, replayed.scorer.trace)
-    summary = replayed.summary()
-    click.echo(json.dumps(summary) if options["as_json"] else summary_text(log, summary))
+    if len(logs) > 1 or options["workers"] or options["cluster"]:
+        _replay_all(logs, config_path, settings, options)
+    else:
+        _replay_one(logs[0], config_path, settings, options)
 
 
 @main.command()
@@ -327,10 +341,7 @@ def calibrate(
     metavar="FILE.py",
     help="A method of your own to compare. Repeatable.",
 )
-@click.option(
-    "--workers", type=click.IntRange(min=1), metavar="N", help="Processes.  [default: all cores]"
-)
-@click.option("--cluster", metavar="ADDRESS", help="A Dask scheduler (needs the extra `cluster`).")
+@_spread
 def experiment(name: str, out: Path, **options: Any) -> None:
     """Repeat one of the paper's figures or tables, with every method on the same input.
 
@@ -363,6 +374,54 @@ def check_config(file: Path) -> None:
     config = load(file)
     load_calibration(config)
     click.echo(dump(config), nl=False)
+
+
+def _replay_one(
+    log: Path, config_path: Path | None, settings: tuple[str, ...], options: dict[str, Any]
+) -> None:
+    from risaf_link.config import load
+    from risaf_link.replay import Replay, Selection
+    from risaf_link.words import summary_text
+
+    config = load(config_path, settings)
+    selection = Selection(options["start"], options["end"], options["outages"])
+    replayed = Replay(config, log, selection, keep_trace=bool(options["plot"]))
+    plot = _plot(options["plot"])
+    with ExitStack() as files, _progress(log) as progress:
+        sinks = _sinks(config, options, files)
+        for received_us, estimate in replayed.estimates(progress):
+            for sink in sinks:
+                sink(received_us, estimate)
+            if plot:
+                plot.take(estimate)
+    if plot:
+        plot.draw(options["plot"], log.name, replayed.scorer.trace)
+    summary = replayed.summary()
+    click.echo(json.dumps(summary) if options["as_json"] else summary_text(log, summary))
+
+
+def _replay_all(
+    logs: tuple[Path, ...],
+    config_path: Path | None,
+    settings: tuple[str, ...],
+    options: dict[str, Any],
+) -> None:
+    from risaf_link.config import load
+    from risaf_link.fleet import replay_all
+    from risaf_link.replay import Selection
+    from risaf_link.words import fleet_text
+
+    for name in ("speed", "out", "plot"):
+        if options[name] is not None:
+            raise ConfigError(f"--{name}: only for one log, without --workers and --cluster")
+    config = load(config_path, settings)
+    selection = Selection(options["start"], options["end"], options["outages"])
+    spread = options["csv"], options["workers"], options["cluster"]
+    rows = replay_all(logs, config, selection, *spread)
+    click.echo(json.dumps(rows) if options["as_json"] else fleet_text(rows))
+    failed = sum("error" in row for row in rows)
+    if failed:
+        raise LogError(f"{failed} of {len(rows)} logs gave nothing")
 
 
 def _open(path: Path, mode: str) -> Any:

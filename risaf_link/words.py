@@ -10,6 +10,12 @@ from rich.table import Table
 from risaf_link.survey import Survey, verdict
 
 MOST_GAPS = 20
+MOST_OUTAGES = 3  # in a line of a table
+MARKS = {"truth": "", "gps": " (GPS)"}
+FLEET = (
+    *("log", "duration s", "epochs", "sensors", "fused", "rejected"),
+    *("x real time", "RMS deg", "without GPS"),
+)
 REFERENCES = {"truth": "truth", "gps": "withheld GPS", None: "nothing to compare with"}
 
 
@@ -40,6 +46,53 @@ def summary_text(log: Path, summary: dict[str, Any]) -> str:
             )
         lines.append(line)
     return "\n".join(lines)
+
+
+def fleet_text(rows: list[dict[str, Any]]) -> str:
+    """What replays of many logs found, or why there is nothing: a line each."""
+    lines = [FLEET, *map(_fleet_line, rows)]
+    whole = [line for line in lines if len(line) == len(FLEET)]
+    widths = [max(map(len, column)) for column in zip(*whole, strict=True)]
+    name = max(len(line[0]) for line in lines)
+    texts = [
+        "  ".join([line[0].ljust(name), *map(str.rjust, line[1:], widths[1:])])
+        if len(line) == len(FLEET)
+        else f"{line[0].ljust(name)}  {line[1]}"
+        for line in lines
+    ]
+    explained = (
+        "RMS deg: of heading, against truth; without GPS: the same in each outage, (GPS) against "
+        "what was withheld"
+    )
+    return "\n".join([*texts, explained])
+
+
+def _fleet_line(row: dict[str, Any]) -> tuple[str, ...]:
+    if "error" in row:
+        return row["log"], row["error"]
+    rmse = row["truth"]["rmse_deg"]
+    return (
+        row["log"],
+        f"{row['duration_s']:.1f}",
+        *(str(row[name]) for name in ("epochs", "sensors")),
+        *(str(row["heading"][name]) for name in ("fused", "rejected")),
+        f"{row['realtime_factor']:.0f}",
+        "-" if rmse is None else f"{rmse:.2f}",
+        _outages(row["outages"]),
+    )
+
+
+def _outages(rows: list[dict[str, Any]]) -> str:
+    """RMSE of each outage, deg: against truth where there is one."""
+    best: dict[tuple[float, float], dict[str, Any]] = {}
+    for row in sorted(rows, key=lambda row: row["reference"] != "truth"):
+        best.setdefault((row["start_s"], row["end_s"]), row)
+    texts = [
+        "-" if row["rmse_deg"] is None else f"{row['rmse_deg']:.2f}{MARKS[row['reference']]}"
+        for _, row in sorted(best.items())
+    ]
+    more = len(texts) - MOST_OUTAGES
+    return (", ".join(texts[:MOST_OUTAGES]) or "-") + (f" and {more} more" if more > 0 else "")
 
 
 def survey_text(log: Path, found: Survey) -> str:

@@ -22,7 +22,7 @@ from risaf_link.experiments.case import Case
 from risaf_link.experiments.cost import Timing, exponent
 from risaf_link.experiments.report import Section, Setting, page, rmses, spread
 from risaf_link.experiments.run import EXPERIMENTS
-from risaf_link.experiments.sweep import Sweep
+from risaf_link.sweep import Sweep
 
 
 def cases(seeds=3):
@@ -73,11 +73,20 @@ def test_other_parameters_are_another_case():
     assert len(keys) == 6
 
 
-def test_a_worker_that_dies_is_told_and_what_was_finished_stays(tmp_path):
-    Sweep(tmp_path, workers=1).run(cases(1), "")
-    with pytest.raises(RisafError, match="a worker process died"):
-        Sweep(tmp_path, workers=1).run([*cases(1), Deadly()], "")
-    assert len(list(tmp_path.glob("*.json"))) == 1
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_case_that_kills_its_workers_is_told_and_costs_only_itself(tmp_path, workers):
+    work = [Deadly(), *cases(3)]
+
+    def told(case, error):
+        return {"key": case.key, "error": str(error)}
+
+    lost, *others = Sweep(tmp_path, workers).run(work, "", failed=told)
+    assert lost["key"] == "deadly"
+    assert "every worker process that ran it died" in lost["error"]
+    assert others == [case.run() for case in cases(3)]
+    with pytest.raises(RisafError, match="deadly: every worker process that ran it died"):
+        Sweep(tmp_path, workers).run(work, "")
+    assert len(list(tmp_path.glob("*.json"))) == 3
 
 
 def test_white_noise_is_read_off_as_angle_random_walk():
@@ -146,7 +155,7 @@ def tiny(monkeypatch):
     short = replace(drives.DRIVES["circle"], quick=(8.0, (4.0, 8.0)))
     monkeypatch.setitem(drives.DRIVES, "circle", short)
     monkeypatch.setattr("risaf_link.experiments.drives.QUICK_SENSORS", 4)
-    monkeypatch.setattr("risaf_link.experiments.sweep._on_cores", in_process)
+    monkeypatch.setattr("risaf_link.sweep._on_cores", in_process)
 
 
 def in_process(cases, _):

@@ -12,9 +12,9 @@ LAYERS = [
     {"mavlink"},
     {"pipeline"},
     {"links", "publish", "sim"},
-    {"config"},
+    {"config", "sweep"},
     {"service", "replay", "survey", "calibrate", "experiments"},
-    {"words"},
+    {"fleet", "words"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from logs import simulated
 
 from risaf_link.config import Config, load
 from risaf_link.core.rotation import wrap
@@ -15,17 +16,9 @@ from risaf_link.mavlink.frame import encode
 from risaf_link.mavlink.tlog import TlogReader, record
 from risaf_link.publish.rows import COLUMNS, RowWriter
 from risaf_link.replay import OutputLog, Replay, Selection
-from risaf_link.sim.scenario import scenario
-from risaf_link.sim.stream import frames, record_time_us
 
 FIXTURES = Path(__file__).parents[1] / "sitl_fixtures"
 GRID = 0.25  # rad/s: coarse readings make ties
-
-
-def simulated(path: Path, duration: float = 12.0, sensors: int = 20, rate: float = 50) -> Path:
-    drive = scenario("circle", seed=3, duration=duration, sensors=sensors, rate=rate)
-    path.write_bytes(b"".join(record(record_time_us(t), raw) for t, raw in frames(drive)))
-    return path
 
 
 def rows_of(log: Path, config: Config) -> list[dict[str, str]]:

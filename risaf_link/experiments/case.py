@@ -4,8 +4,6 @@ import hashlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -22,12 +20,12 @@ from risaf_link.sim.disturbances import Spikes
 from risaf_link.sim.faults import FAULTS
 from risaf_link.sim.scenario import Scenario
 from risaf_link.sim.scenario import scenario as choose
+from risaf_link.sweep import Row, program
 
 SCORED = 0.1  # s, from one comparison to the next
 TRACED = 0.5  # s, from one point of a figure to the next
 
-PACKAGE = Path(__file__).parents[1]
-Row = dict[str, Any]
+PARTS = ("core", "sim", "mavlink", "experiments", "pipeline.py")  # what a result depends on
 
 
 class Case(Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,27 +49,12 @@ class Case(Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def key(self) -> str:
         """Name of this case and of the program that runs it."""
-        content = msgspec.json.encode(self) + program().encode()
+        content = msgspec.json.encode(self) + program(*PARTS).encode()
         return f"{self.scenario}-{self.seed}-{hashlib.sha256(content).hexdigest()[:16]}"
 
     def run(self) -> Row:
         """Run the case."""
         return run(self)
-
-
-@cache
-def program() -> str:
-    """Digest of the program, as far as results depend on it."""
-    files = [
-        path
-        for part in ("core", "sim", "mavlink", "experiments")
-        for path in (PACKAGE / part).rglob("*")
-        if path.suffix in {".py", ".so"}
-    ]
-    digest = hashlib.sha256((PACKAGE / "pipeline.py").read_bytes())
-    for path in sorted(files):
-        digest.update(path.relative_to(PACKAGE).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()
 
 
 def scenario_of(case: Case) -> Scenario:

@@ -12,12 +12,12 @@ from msgspec import Struct
 from risaf_link.core.fusion import Epoch
 from risaf_link.core.kernel import BUILT
 from risaf_link.core.rotation import Floats
-from risaf_link.experiments.case import program
+from risaf_link.experiments.case import PARTS
 from risaf_link.experiments.catalogue import METHODS, make, titles
 from risaf_link.experiments.figures import colour, figure, legend
 from risaf_link.experiments.method import ArrayModel
 from risaf_link.experiments.report import Section, Setting, write
-from risaf_link.experiments.sweep import Row
+from risaf_link.sweep import Row, program
 
 SENSORS = (3, 10, 30, 100, 150, 300, 1000)
 FITTED_FROM = 100  # sensors; below, what does not depend on them counts
@@ -41,7 +41,7 @@ class Timing(Struct, frozen=True):
     @property
     def key(self) -> str:
         """Name of the result: on this machine, of this program."""
-        content = msgspec.json.encode(self) + program().encode() + platform.node().encode()
+        content = msgspec.json.encode(self) + program(*PARTS).encode() + platform.node().encode()
         return f"cost-{hashlib.sha256(content).hexdigest()[:16]}"
 
     def run(self) -> Row:

@@ -19,7 +19,7 @@ from risaf_link.experiments.figures import (
     unwrapped,
 )
 from risaf_link.experiments.report import Section, Setting, rmses, spread, write
-from risaf_link.experiments.sweep import Row
+from risaf_link.sweep import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

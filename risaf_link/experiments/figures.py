@@ -8,7 +8,7 @@ import numpy as np
 
 from risaf_link.core.rotation import Floats
 from risaf_link.errors import ConfigError
-from risaf_link.experiments.sweep import Row
+from risaf_link.sweep import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ import numpy as np
 
 from risaf_link import __version__
 from risaf_link.errors import ConfigError
-from risaf_link.experiments.sweep import Row, Sweep
+from risaf_link.sweep import Row, Sweep
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

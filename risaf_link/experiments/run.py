@@ -11,8 +11,8 @@ from risaf_link.experiments.cost import cost
 from risaf_link.experiments.drives import DRIVES, drive, outages
 from risaf_link.experiments.report import Section, Setting, page
 from risaf_link.experiments.sensors import sensors
-from risaf_link.experiments.sweep import Sweep
 from risaf_link.experiments.sweeps import faults, montecarlo, sensitivity
+from risaf_link.sweep import Sweep
 
 EXPERIMENTS: dict[str, Callable[[Setting], Section]] = {
     "sensors": sensors,
