@@ -15,7 +15,8 @@
 
 // A function with all it calls, built for several processors; which one it is, is seen at run time.
 #if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
-#define RISAF_FAST [[gnu::target_clones("arch=x86-64-v4", "avx2", "default"), gnu::flatten]]
+#define RISAF_FAST \
+  [[gnu::flatten, gnu::target_clones("arch=x86-64-v4", "avx2", "arch=x86-64-v2", "default")]]
 #else
 #define RISAF_FAST [[gnu::flatten]]
 #endif
