@@ -20,7 +20,7 @@ import numpy as np
 from risaf_link.config import load
 from risaf_link.core.rotation import Floats, euler_from_quaternion
 from risaf_link.mavlink.frame import FrameParser
-from risaf_link.mavlink.ingest import truth_of
+from risaf_link.mavlink.truth import truth_of
 from risaf_link.pipeline import Pipeline
 from risaf_link.sim.scenario import BOOT_US, scenario
 from risaf_link.sim.stream import frames

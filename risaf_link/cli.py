@@ -15,13 +15,13 @@ from risaf_link.errors import ConfigError, LinkError, LogError, RisafError
 
 if TYPE_CHECKING:  # what a command needs is imported when it runs: help must come at once
     from risaf_link.config import Config
-    from risaf_link.core.estimate import Estimate
+    from risaf_link.core.estimate import EstimateBlock
     from risaf_link.publish.plot import HeadingPlot
 
 EXIT_STATUS: dict[type[RisafError], int] = {ConfigError: 2, LinkError: 2, LogError: 3}
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-Sink = Callable[[int, "Estimate"], None]
+Sink = Callable[["EstimateBlock"], None]
 
 
 class _Commands(click.Group):
@@ -388,12 +388,11 @@ def _replay_one(
     replayed = Replay(config, log, selection, keep_trace=bool(options["plot"]))
     plot = _plot(options["plot"])
     with ExitStack() as files, _progress(log) as progress:
-        sinks = _sinks(config, options, files)
-        for received_us, estimate in replayed.estimates(progress):
+        sinks = [*_sinks(config, options, files), *([plot.take] if plot else [])]
+        singly = bool(options["out"] or options["speed"])
+        for block in replayed.blocks(progress, singly):
             for sink in sinks:
-                sink(received_us, estimate)
-            if plot:
-                plot.take(estimate)
+                sink(block)
     if plot:
         plot.draw(options["plot"], log.name, replayed.scorer.trace)
     summary = replayed.summary()
@@ -432,7 +431,7 @@ def _open(path: Path, mode: str) -> Any:
 
 
 def _sinks(config: "Config", options: dict[str, Any], files: ExitStack) -> list[Sink]:
-    """What is to be done with every estimate."""
+    """What is to be done with the estimates."""
     from risaf_link.publish.rows import RowWriter
     from risaf_link.replay import OutputLog
 
@@ -441,10 +440,10 @@ def _sinks(config: "Config", options: dict[str, Any], files: ExitStack) -> list[
         sinks.append(_pace(options["speed"]))
     if options["out"]:
         log = OutputLog(config, files.enter_context(_open(options["out"], "wb")))
-        sinks.append(lambda received_us, estimate: log.write(estimate, received_us))
+        sinks.append(log.write)
     if options["csv"]:
         rows = RowWriter(files.enter_context(_open(options["csv"], "w")))
-        sinks.append(lambda _, estimate: rows.write(estimate))
+        sinks.append(rows.write)
     return sinks
 
 
@@ -452,8 +451,8 @@ def _pace(speed: float) -> Sink:
     """Hold estimates back until their time has come."""
     began: list[float] = []
 
-    def wait(_: int, estimate: "Estimate") -> None:
-        due = estimate.elapsed / speed
+    def wait(block: "EstimateBlock") -> None:
+        due = float(block.elapsed[-1]) / speed
         began[:] = began or [time.monotonic() - due]
         time.sleep(max(0.0, began[0] + due - time.monotonic()))
 

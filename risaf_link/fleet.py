@@ -194,9 +194,9 @@ def _size(path: Path) -> int:
 
 def _summary(replay: LogReplay, rows: RowWriter | None = None) -> Row:
     replayed = Replay(replay.config, Path(replay.log), replay.selection)
-    for _, estimate in replayed.estimates():
+    for block in replayed.blocks():
         if rows:
-            rows.write(estimate)
+            rows.write(block)
     return replayed.summary()
 
 

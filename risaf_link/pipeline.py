@@ -7,6 +7,8 @@ Nothing here reads a clock, opens a file or waits. A live link and a log feed th
 that a live run that is recorded and replayed gives the same estimates, bit for bit.
 """
 
+from itertools import groupby
+
 import numpy as np
 from msgspec import Struct, field, structs
 
@@ -18,10 +20,12 @@ from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import ArrayHealth
 from risaf_link.mavlink.clock import VehicleClock
+from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
-from risaf_link.mavlink.ingest import GpsParameters, Ingest
+from risaf_link.mavlink.ingest import SAMPLES, GpsParameters, Ingest
 
+MOST_WAITING = 256  # epochs
 HEALTH_PERIOD = 0.1  # s, from one judgement of the sensors to the next
 
 
@@ -62,6 +66,7 @@ class Pipeline:
         p = parameters
         sensors = p.array.sensors or (len(calibration.gyros) if calibration else 0)
         self.ingest = Ingest(p.array, p.gps, own)
+        self._decisive = {*self.ingest.message_ids, IDS["SYSTEM_TIME"]} - SAMPLES
         self.assembler = EpochAssembler(structs.replace(p.array, sensors=sensors))
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
@@ -72,6 +77,7 @@ class Pipeline:
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
         self._elapsed = 0.0  # s, of epochs
+        self._waiting: list[tuple[Epoch, int]] = []
 
     def step(self, frame: Frame, received_us: int) -> list[Estimate]:
         """Take one frame; the estimates that became possible by it, one an epoch.
@@ -82,24 +88,46 @@ class Pipeline:
         received_us : int
             When it came, microseconds since 1970.
         """
+        blocks = self.gather(frame, received_us) + self.release()
+        return [estimate for block in blocks for estimate in block]
+
+    def flush(self, received_us: int) -> list[EstimateBlock]:
+        """Use what is left when the links, or a log, have ended."""
+        self._wait(self.assembler.flush(), received_us)
+        return self.release()
+
+    def gather(self, frame: Frame, received_us: int) -> list[EstimateBlock]:
+        """Take one frame as `step` does, only that epochs wait for `release`.
+
+        They are released before a frame that bears on what they come to: estimates are the same.
+        """
+        blocks = self.release() if frame.message_id in self._decisive else []
         self._clock.hear(frame, received_us)
         datum = self.ingest.decode(frame, received_us)
         if isinstance(datum, GyroChunk):
-            return self._estimates(self.assembler.add(datum), received_us)
-        if isinstance(datum, GpsFix):
+            self._wait(self.assembler.add(datum), received_us)
+        elif isinstance(datum, GpsFix):
             self._correct(datum)
-        return []
+        return blocks + (self.release() if len(self._waiting) >= MOST_WAITING else [])
 
-    def flush(self, received_us: int) -> list[Estimate]:
-        """Use what is left when a log has ended."""
-        return self._estimates(self.assembler.flush(), received_us)
+    def release(self) -> list[EstimateBlock]:
+        """Use the epochs that wait."""
+        waiting, self._waiting = self._waiting, []
+        same_array = groupby(waiting, lambda each: (each[0].rates_b.shape, each[0].forces_b.shape))
+        blocks = (self._advance(EpochBlock.of(list(epochs))) for _, epochs in same_array)
+        return [block for block in blocks if block]
 
-    def _estimates(self, epochs: list[Epoch], received_us: int) -> list[Estimate]:
-        blocks = [self.advance(EpochBlock.of(epoch, received_us)) for epoch in epochs]
-        return [block.at(0) for block in blocks if block]
+    def advance(self, epochs: EpochBlock) -> list[EstimateBlock]:
+        """Carry the estimate on over epochs that ingest and assembler have handed on already."""
+        before = self.release()
+        block = self._advance(epochs)
+        return [*before, block] if block else before
 
-    def advance(self, epochs: EpochBlock) -> EstimateBlock | None:
-        """Carry the estimate on over epochs between which no fix came; None: they do not fit."""
+    def _wait(self, epochs: list[Epoch], received_us: int) -> None:
+        self._waiting += [(epoch, received_us) for epoch in epochs]
+
+    def _advance(self, epochs: EpochBlock) -> EstimateBlock | None:
+        """Carry the estimate on; None: the calibration is not of this array."""
         sensors = epochs.rates_b.shape[1]
         if not self._fits(sensors):
             return None

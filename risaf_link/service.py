@@ -86,7 +86,8 @@ class Service:
                 try:
                     await self._beat()
                 finally:  # the links are still open
-                    self._send(self.pipeline.flush(self._received_us))
+                    for block in self.pipeline.flush(self._received_us):
+                        self._send(list(block))
         finally:
             counts = self.pipeline.assembler.counts
             _log.info("ended: %d frames, %d epochs", self._frames, counts["epochs"])

@@ -13,8 +13,9 @@ from risaf_link.links.file import read
 from risaf_link.mavlink.dialect import name_of
 from risaf_link.mavlink.epoch import EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
-from risaf_link.mavlink.ingest import Ingest, truth_of
+from risaf_link.mavlink.ingest import Ingest
 from risaf_link.mavlink.tlog import TlogReader
+from risaf_link.mavlink.truth import truth_of
 
 GAP = 1.0  # s, between epochs
 REORDERED = 128  # a larger step of the sequence number is a frame out of order

@@ -14,7 +14,8 @@ from risaf_link.experiments.catalogue import make
 from risaf_link.experiments.inputs import array_model, instants
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import FrameParser
-from risaf_link.mavlink.ingest import GpsParameters, Ingest, truth_of
+from risaf_link.mavlink.ingest import GpsParameters, Ingest
+from risaf_link.mavlink.truth import truth_of
 from risaf_link.pipeline import Pipeline
 from risaf_link.sim.scenario import scenario
 from risaf_link.sim.stream import frames

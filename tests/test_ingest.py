@@ -14,7 +14,8 @@ from risaf_link.core.heading import GpsFix
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import FrameParser, encode
-from risaf_link.mavlink.ingest import GpsParameters, Ingest, truth_of
+from risaf_link.mavlink.ingest import GpsParameters, Ingest
+from risaf_link.mavlink.truth import truth_of
 
 G = 9.80665
 SECOND = 1_000_000

@@ -24,8 +24,8 @@ GRID = 0.25  # rad/s: coarse readings make ties
 def rows_of(log: Path, config: Config) -> list[dict[str, str]]:
     file = io.StringIO()
     rows = RowWriter(file)
-    for _, estimate in Replay(config, log, Selection()).estimates():
-        rows.write(estimate)
+    for block in Replay(config, log, Selection()).blocks():
+        rows.write(block)
     file.seek(0)
     return list(csv.DictReader(file))
 
@@ -98,13 +98,14 @@ def test_rows_have_the_columns_and_the_precision_that_were_promised(tmp_path):
 def test_an_outage_is_scored_against_truth_and_against_what_was_withheld(tmp_path):
     log = simulated(tmp_path / "drive.tlog")
     replay = Replay(Config(), log, Selection(outages=((6.0, 11.0),)), keep_trace=True)
-    states = [(estimate.elapsed, estimate.heading.state.name) for _, estimate in replay.estimates()]
+    states = [(e.elapsed, e.heading.state.name) for block in replay.blocks() for e in block]
     assert {state for t, state in states if 8.5 < t < 11.0} == {"DEAD_RECKONING"}
     assert [row["reference"] for row in replay.summary()["outages"]] == ["truth", "gps"]
     for row in replay.summary()["outages"]:
         errors = [
             math.degrees(e)
-            for t, reference, e in replay.scorer.trace
+            for reference, *errors in replay.scorer.trace
+            for t, e in zip(*errors, strict=True)
             if reference == row["reference"] and 6.0 <= t <= 11.0
         ]
         assert len(errors) > 20
@@ -120,8 +121,7 @@ def test_gps_that_is_withheld_does_not_reach_the_filter(tmp_path):
 
     def fused(*outages: tuple[float, float]) -> int:
         replay = Replay(Config(), log, Selection(outages=outages))
-        for _ in replay.estimates():
-            pass
+        list(replay.blocks())
         return int(replay.summary()["heading"]["fused"])
 
     assert fused() - fused((4.0, 8.0)) == 20  # at 5 Hz
@@ -130,7 +130,7 @@ def test_gps_that_is_withheld_does_not_reach_the_filter(tmp_path):
 def test_start_and_end_cut_the_log(tmp_path):
     log = simulated(tmp_path / "drive.tlog")
     replay = Replay(Config(), log, Selection(start=2.0, end=5.0))
-    times = [estimate.time_us for _, estimate in replay.estimates()]
+    times = [estimate.time_us for block in replay.blocks() for estimate in block]
     assert (times[0], times[-1]) == pytest.approx((3_000_000, 6_000_000), abs=20_000)
     assert replay.summary()["duration_s"] == pytest.approx(3.0, abs=0.05)
 
@@ -139,10 +139,9 @@ def test_the_output_log_has_messages_at_their_rates_and_a_heartbeat(tmp_path):
     config = load(None, ["emit={ATTITUDE_QUATERNION: 10, ARRAY_STATUS: 1}"])
     file = io.BytesIO()
     output = OutputLog(config, file)
-    for received_us, estimate in Replay(
-        config, simulated(tmp_path / "d.tlog"), Selection()
-    ).estimates():
-        output.write(estimate, received_us)
+    replay = Replay(config, simulated(tmp_path / "d.tlog"), Selection())
+    for block in replay.blocks(singly=True):
+        output.write(block)
     ids = [logged.frame.message_id for logged in TlogReader([file.getvalue()])]
     counts = {name: ids.count(IDS[name]) for name in ("ATTITUDE_QUATERNION", "ARRAY_STATUS")}
     assert counts == {"ATTITUDE_QUATERNION": 120, "ARRAY_STATUS": 12}
@@ -155,7 +154,7 @@ def test_a_calibration_that_is_not_the_arrays_gives_no_estimates_and_says_why(tm
     config = load(None, [f"array.calibration={path}"])
     replay = Replay(config, simulated(tmp_path / "drive.tlog", duration=1), Selection())
     with pytest.raises(Exception, match=r"array\.calibration: .* for 2 sensors, the array has 20"):
-        list(replay.estimates())
+        list(replay.blocks())
 
 
 def test_a_calibration_is_applied_to_raw_readings(tmp_path):
@@ -175,7 +174,7 @@ class TestRecordings:
     @pytest.mark.parametrize("log", sorted(FIXTURES.glob("*.tlog")), ids=lambda path: path.stem)
     def test_an_autopilots_gyros_make_a_small_array(self, log):
         replay = Replay(Config(), log, Selection(end=30.0))
-        estimates = [estimate for _, estimate in replay.estimates()]
+        estimates = [estimate for block in replay.blocks() for estimate in block]
         summary = replay.summary()
         assert (summary["sensors"], summary["dropped"]) == (3, {})
         q_nb = np.array([estimate.attitude.q_nb for estimate in estimates])
@@ -184,8 +183,7 @@ class TestRecordings:
 
     def test_the_unplugged_receiver_is_found_and_scored_against_the_truth(self):
         replay = Replay(Config(), FIXTURES / "rover_sitl_gps_unplugged.tlog", Selection())
-        for _ in replay.estimates():
-            pass
+        list(replay.blocks())
         (outage,) = replay.summary()["outages"]
         assert outage["reference"] == "truth"
         assert (outage["start_s"], outage["end_s"]) == pytest.approx((73.3, 229.4), abs=0.2)

@@ -129,8 +129,8 @@ def outputs(heard: list[Frame]) -> list[tuple[int, bytes]]:
 def replayed(config: Config, log: Path) -> list[tuple[int, bytes]]:
     file = io.BytesIO()
     output = OutputLog(config, file)
-    for received_us, estimate in Replay(config, log, Selection()).estimates():
-        output.write(estimate, received_us)
+    for block in Replay(config, log, Selection()).blocks(singly=True):
+        output.write(block)
     return outputs([logged.frame for logged in TlogReader([file.getvalue()])])
 
 

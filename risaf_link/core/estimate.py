@@ -1,5 +1,6 @@
 """What is known at one epoch: all that is told to others."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,9 @@ class EstimateBlock:
 
     def __len__(self) -> int:
         return len(self.time_us)
+
+    def __iter__(self) -> Iterator[Estimate]:
+        return map(self.at, range(len(self)))
 
     def at(self, i: int) -> Estimate:
         """The output at one epoch."""

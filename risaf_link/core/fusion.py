@@ -8,6 +8,7 @@ Inside, the readings stand by channel, shape (3, n), since NumPy is quickest alo
 reading that is not finite is not valid.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
@@ -76,14 +77,14 @@ class EpochBlock:
     received_us: NDArray[np.int64]  # (k,) when the frame came that made each of them whole
 
     @classmethod
-    def of(cls, epoch: Epoch, received_us: int) -> "EpochBlock":
-        """One epoch alone."""
+    def of(cls, epochs: Sequence[tuple[Epoch, int]]) -> "EpochBlock":
+        """Put single epochs together, each with the time at which it was received."""
         return cls(
-            np.array([epoch.time_us]),
-            np.array([epoch.dt]),
-            epoch.rates_b[np.newaxis],
-            epoch.forces_b[np.newaxis],
-            np.array([received_us]),
+            np.array([epoch.time_us for epoch, _ in epochs]),
+            np.array([epoch.dt for epoch, _ in epochs]),
+            np.array([epoch.rates_b for epoch, _ in epochs]),
+            np.array([epoch.forces_b for epoch, _ in epochs]),
+            np.array([received_us for _, received_us in epochs]),
         )
 
     def __len__(self) -> int:

@@ -24,10 +24,30 @@ def wrap(angle: float) -> float:
     return math.pi if remainder == -math.pi else remainder
 
 
+def wraps(angles: Floats) -> Floats:
+    """Bring angles, rad, into [-pi, pi)."""
+    return (angles + math.pi) % math.tau - math.pi
+
+
 def yaw_of(q_nb: Floats) -> float:
     """Yaw, rad, in [-pi, pi], of an attitude quaternion, shape (4,), of any length but zero."""
     w, x, y, z = q_nb.tolist()
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def eulers_of(q_nb: Floats) -> Floats:
+    """Roll, pitch and yaw, (3, k) rad, of k unit quaternions, (k, 4): `euler_from_quaternion`."""
+    w, x, y, z = q_nb.T
+    roll = np.arctan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
+    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
+    return np.array([roll, pitch, yaws_of(q_nb)])
+
+
+def yaws_of(q_nb: Floats) -> Floats:
+    """Yaw, (k,) rad, of k attitude quaternions, (k, 4)."""
+    w, x, y, z = q_nb.T
+    yaw: Floats = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return yaw
 
 
 def euler_from_quaternion(q_nb: Floats) -> tuple[float, float, float]:

@@ -4,7 +4,9 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from risaf_link.core.rotation import wrap
+import numpy as np
+
+from risaf_link.core.rotation import Floats, wrap, wraps
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,20 @@ class ErrorAccount:
         size = abs(wrap(error))
         self._squares += size * size
         self._largest = max(self._largest, size)
+
+    def add_all(self, time_s: Floats, errors: Floats) -> None:
+        """Take errors, (m,) rad, at times, (m,) s, in the order of time."""
+        if not len(errors):
+            return
+        last = self._last[1] if self._samples else float(errors[0])
+        unwrapped = last + np.cumsum(wraps(np.diff(errors, prepend=last)))
+        if not self._samples:
+            self._first = (float(time_s[0]), float(unwrapped[0]))
+        self._last = (float(time_s[-1]), float(unwrapped[-1]))
+        self._samples += len(errors)
+        sizes = np.abs(wraps(unwrapped))
+        self._squares += float(sizes @ sizes)
+        self._largest = max(self._largest, float(sizes.max()))
 
     def score(self) -> HeadingScore | None:
         """The score so far; None without any error."""

@@ -59,6 +59,31 @@ class Track:
         return self.values[:, RATE]
 
     @property
+    def bias_b(self) -> Floats:
+        """Bias of the fused rate, (k, 3), rad/s."""
+        return self.values[:, BIAS]
+
+    @property
+    def fused_b(self) -> Floats:
+        """Fused rate, before the bias is taken off, (k, 3), rad/s."""
+        return self.values[:, FUSED]
+
+    @property
+    def variance(self) -> Floats:
+        """Variance of one sensor behind the fused rate, (k, 3), (rad/s)^2."""
+        return self.values[:, VARIANCE]
+
+    @property
+    def active(self) -> NDArray[np.int64]:
+        """Sensors behind the fused rate, (k, 3)."""
+        return self.values[:, ACTIVE].astype(np.int64)
+
+    @property
+    def angle_std(self) -> Floats:
+        """Standard deviations of roll, pitch and yaw, (k, 3), rad."""
+        return self.values[:, STD]
+
+    @property
     def force_b(self) -> Floats:
         """Fused specific force, (k, 3), m/s^2; NaN: there is no accelerometer."""
         return self.values[:, FORCE]

@@ -269,7 +269,7 @@ class EpochAssembler:
     def _instant_of(self, chunk: GyroChunk) -> int:
         """When the epoch that a chunk belongs to began."""
         time_us = chunk.time_us
-        if not chunk.tolerance_us:
+        if not chunk.tolerance_us or time_us in self._gyros.open:
             return time_us
         known = (*self._gyros.open, *self._gyros.gone)
         nearest_us = min(known, key=lambda known_us: abs(known_us - time_us), default=time_us)

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Struct
 
 from risaf_link.core.heading import GpsFix
-from risaf_link.core.rotation import Floats, quaternion_from_euler
+from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.choice import Choice, Streams
 from risaf_link.mavlink.dialect import IDS, name_of, reader
 from risaf_link.mavlink.epoch import MAX_SENSORS, ArrayParameters, GyroChunk, Source
@@ -33,6 +33,8 @@ ARRAY_SIZE = 254  # payload of GYRO_ARRAY and ACCEL_ARRAY; its last bytes: senso
 ARRAY_CAPACITY, DEBUG_CAPACITY = 40, 19  # sensors a message
 SCALED_IMUS = [IDS["SCALED_IMU"], IDS["SCALED_IMU2"], IDS["SCALED_IMU3"]]
 FINEST_FIRST = [IDS["HIGHRES_IMU"], IDS["RAW_IMU"], *SCALED_IMUS]
+SAMPLES = {IDS[name] for name in ("GYRO_ARRAY", "ACCEL_ARRAY", "DEBUG_FLOAT_ARRAY")}
+SAMPLES |= {*FINEST_FIRST}  # messages that carry readings
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 SIDEWAYS = frozenset({1, 2, 3, 4, 7, 8, *range(12, 18), *range(19, 26), 28, 29, 35, 37, 43, 45, 47})
 """MAV_TYPE of what goes where it does not point: it hovers, drifts with the wind, or dives.
@@ -50,14 +52,6 @@ class GpsParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """Which GPS messages are believed, the best first."""
 
     messages: tuple[GpsMessage, ...] = ("GPS_RAW_INT", "GPS2_RAW", "GPS_INPUT", "HIL_GPS")
-
-
-@dataclass(frozen=True, slots=True)
-class Truth:
-    """The true attitude, from a simulator: for scoring only."""
-
-    time_us: int | None  # on the vehicle's clock; None: the message has no time
-    q_nb: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,19 +341,6 @@ class Ingest:
         return repeated
 
 
-def truth_of(frame: Frame) -> Truth | None:
-    """The true attitude, if a simulator states it in this frame."""
-    if frame.message_id == IDS["HIL_STATE_QUATERNION"]:
-        time_us, q_nb = _HIL_STATE(frame.payload)
-        stated = any(q_nb) and all(map(math.isfinite, q_nb))
-        return Truth(time_us, np.array(q_nb)) if stated else None
-    if frame.message_id in _SIM_STATES:
-        angles = _SIM_STATES[frame.message_id](frame.payload)
-        stated = all(map(math.isfinite, angles))
-        return Truth(None, quaternion_from_euler(*angles)) if stated else None
-    return None
-
-
 def _text(field: bytes) -> str:
     """Text of a field, which ends at the first NUL."""
     return field.partition(b"\0")[0].decode(errors="replace")
@@ -373,7 +354,6 @@ def _remember(memory: dict[Key, Value], key: Key, value: Value) -> None:
         del memory[next(iter(memory))]
 
 
-_EULER = ("roll", "pitch", "yaw")
 _IMU = ("xgyro", "ygyro", "zgyro", "xacc", "yacc", "zacc")
 _INFO = reader(
     "IMU_ARRAY_INFO",
@@ -384,5 +364,3 @@ _HIGHRES = reader("HIGHRES_IMU", "time_usec", *_IMU, "id")
 _HEARTBEAT = reader("HEARTBEAT", "type", "autopilot")
 _RAW = reader("RAW_IMU", "time_usec", *_IMU, "id")
 _SCALED = reader("SCALED_IMU", "time_boot_ms", *_IMU)
-_HIL_STATE = reader("HIL_STATE_QUATERNION", "time_usec", "attitude_quaternion")
-_SIM_STATES = {IDS[name]: reader(name, *_EULER) for name in ("SIM_STATE", "SIMSTATE")}

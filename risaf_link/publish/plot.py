@@ -1,11 +1,13 @@
 """The heading over time and its error, as a picture."""
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 
-from risaf_link.core.estimate import Estimate
+import numpy as np
+
+from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.heading import HeadingState
+from risaf_link.core.rotation import Floats, yaws_of
 from risaf_link.errors import RisafError
 
 STEP_S = 0.1  # between two points
@@ -25,16 +27,16 @@ class HeadingPlot:
         mpl.use("Agg")
         self._points: list[tuple[float, float, float, bool]] = []
 
-    def take(self, estimate: Estimate) -> None:
-        """Take the next estimate."""
-        if self._points and estimate.elapsed < self._points[-1][0] + STEP_S:
-            return
-        attitude = estimate.attitude
-        yaw = attitude.euler[2] if attitude.aligned else math.nan
-        is_out = estimate.heading.state is HeadingState.DEAD_RECKONING
-        self._points.append((estimate.elapsed, yaw, attitude.yaw_std, is_out))
+    def take(self, block: EstimateBlock) -> None:
+        """Take the next estimates."""
+        track = block.track
+        yaw = np.where(track.aligned, yaws_of(track.q_nb), np.nan)
+        is_out = block.heading.state == HeadingState.DEAD_RECKONING
+        for point in zip(block.elapsed, yaw, track.yaw_std, is_out, strict=True):
+            if not self._points or point[0] >= self._points[-1][0] + STEP_S:
+                self._points.append(point)
 
-    def draw(self, path: Path, title: str, trace: Iterable[tuple[float, str, float]]) -> None:
+    def draw(self, path: Path, title: str, trace: Iterable[tuple[str, Floats, Floats]]) -> None:
         """Write the picture.
 
         Parameters
@@ -42,10 +44,9 @@ class HeadingPlot:
         path : Path
             PNG, or whatever its suffix says.
         title : str
-        trace : iterable of (float, str, float)
-            Heading errors: seconds, reference, rad.
+        trace : iterable of (str, ndarray, ndarray)
+            Heading errors of a reference: its name, seconds, rad.
         """
-        import numpy as np
         from matplotlib import pyplot as plt
 
         time_s, yaw, std, is_out = np.array(self._points).T
@@ -57,9 +58,11 @@ class HeadingPlot:
         std = np.where(np.isnan(yaw), np.nan, np.degrees(std))
         below.fill_between(time_s, -std, std, alpha=0.2, linewidth=0, label="one sigma, estimated")
         for reference, label in MARKERS.items():
-            errors = [(t, math.degrees(e)) for t, name, e in trace if name == reference]
-            if errors:
-                below.plot(*zip(*errors, strict=True), ".", markersize=2, label=f"against {label}")
+            parts = [np.array(part) for name, *part in trace if name == reference]
+            errors = np.hstack(parts) if parts else np.zeros((2, 0))
+            if errors.size:
+                errors_deg = np.degrees(errors[1])
+                below.plot(errors[0], errors_deg, ".", markersize=2, label=f"against {label}")
         below.set(ylabel="heading error (deg)", xlabel="time since the first sample (s)")
         for axes in (above, below):
             axes.fill_between(

@@ -2,7 +2,11 @@
 
 from typing import TextIO
 
-from risaf_link.core.estimate import Estimate
+import numpy as np
+
+from risaf_link.core.estimate import EstimateBlock
+from risaf_link.core.heading import HeadingState
+from risaf_link.core.rotation import eulers_of
 
 COLUMNS = (
     *("time_us", "q_w", "q_x", "q_y", "q_z", "roll", "pitch", "yaw"),
@@ -13,7 +17,7 @@ COLUMNS = (
 
 
 class RowWriter:
-    """Writes one row an estimate.
+    """Writes one row an epoch.
 
     `fused_*` is the array's rate before the filter's bias is taken off; `heading_state` is the name
     of the state in GPS_HEADING_STATUS.
@@ -23,19 +27,23 @@ class RowWriter:
         self._file = file
         file.write(",".join(COLUMNS) + "\n")
 
-    def write(self, estimate: Estimate) -> None:
-        """Write the row of one epoch."""
-        fused, attitude = estimate.fused, estimate.attitude
-        values = (
-            estimate.time_us,
-            *attitude.q_nb.tolist(),
-            *attitude.euler,
-            *fused.rate_b.tolist(),
-            *fused.variance.tolist(),
-            *fused.active.tolist(),
-            *attitude.bias_b.tolist(),
-            attitude.roll_std,
-            attitude.pitch_std,
-            attitude.yaw_std,
+    def write(self, block: EstimateBlock) -> None:
+        """Write the rows of the next epochs."""
+        track = block.track
+        values = np.column_stack(
+            (
+                *(track.q_nb, eulers_of(track.q_nb).T, track.fused_b, track.variance),
+                *(track.bias_b, track.angle_std),
+            )
         )
-        self._file.write(",".join(map(repr, values)) + f",{estimate.heading.state.name}\n")
+        rows = zip(
+            block.time_us.tolist(),
+            values.tolist(),
+            track.active.tolist(),
+            block.heading.state.tolist(),
+            strict=True,
+        )
+        for time_us, row, active, state in rows:
+            before, after = row[:13], row[13:]
+            texts = map(repr, (time_us, *before, *active, *after))
+            self._file.write(",".join(texts) + f",{HeadingState(state).name}\n")

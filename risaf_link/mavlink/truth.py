@@ -1,0 +1,74 @@
+"""The true attitude, where a simulator states it: for scoring only."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from risaf_link.core.rotation import Floats, quaternion_from_euler, yaw_of, yaws_of
+from risaf_link.mavlink.dialect import IDS, reader
+from risaf_link.mavlink.frame import Frame, FrameTable
+from risaf_link.mavlink.tlog import Stamps
+
+HIL_STATE = IDS["HIL_STATE_QUATERNION"]
+HIL_HEAD = np.dtype([("time_us", "<u8"), ("q_nb", "<f4", 4)])  # how its payload begins
+
+_read_hil_state = reader("HIL_STATE_QUATERNION", "time_usec", "attitude_quaternion")
+_SIM_STATES = {
+    IDS[name]: reader(name, "roll", "pitch", "yaw") for name in ("SIM_STATE", "SIMSTATE")
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The true attitude at an instant."""
+
+    time_us: int | None  # on the vehicle's clock; None: the message has no time
+    q_nb: Floats
+
+
+def truth_of(frame: Frame) -> Truth | None:
+    """The true attitude, if a simulator states it in this frame."""
+    if frame.message_id == HIL_STATE:
+        time_us, q_nb = _read_hil_state(frame.payload)
+        stated = any(q_nb) and all(map(math.isfinite, q_nb))
+        return Truth(time_us, np.array(q_nb)) if stated else None
+    if frame.message_id in _SIM_STATES:
+        angles = _SIM_STATES[frame.message_id](frame.payload)
+        stated = all(map(math.isfinite, angles))
+        return Truth(None, quaternion_from_euler(*angles)) if stated else None
+    return None
+
+
+def truths_in(table: FrameTable, times_us: Stamps) -> Iterator[tuple[Floats, Floats, bool]]:
+    """True yaws that are stated in a table.
+
+    Parameters
+    ----------
+    table : FrameTable
+    times_us : ndarray of uint64
+        When each frame came.
+
+    Yields
+    ------
+    time_us, yaw : ndarray, shape (m,)
+        us and rad.
+    by_boot : bool
+        Whether the times are those of the vehicle's clock, not of the arrival.
+    """
+    ids, sizes = table.cuts["message_id"], table.cuts["size"]
+    whole = (ids == HIL_STATE) & (sizes >= HIL_HEAD.itemsize)
+    starts = table.payloads[whole]
+    payloads = np.frombuffer(table.buffer, np.uint8)[starts[:, None] + np.arange(HIL_HEAD.itemsize)]
+    heads = payloads.view(HIL_HEAD)[:, 0]
+    q_nb = heads["q_nb"].astype(float)
+    stated = np.isfinite(q_nb).all(axis=1) & q_nb.any(axis=1)
+    yield heads["time_us"][stated].astype(float), yaws_of(q_nb[stated]), True
+    others = np.isin(ids, [HIL_STATE, *_SIM_STATES]) & ~whole
+    for row in np.flatnonzero(others).tolist():
+        truth = truth_of(table.frame(row))
+        if truth:
+            by_boot = truth.time_us is not None
+            time_us = truth.time_us if truth.time_us is not None else int(times_us[row])
+            yield np.array([float(time_us)]), np.array([yaw_of(truth.q_nb)]), by_boot
