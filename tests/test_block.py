@@ -230,6 +230,14 @@ class TestUsual:
         expected, blocks = assert_same(log)
         assert share(blocks, expected) > 0.95
 
+    def test_nor_do_the_sensors_of_an_autopilot_that_are_not_listened_to(self):
+        log = Log(4)
+        imus(log, 0, 2)
+        expected, blocks = assert_same(log)
+        assert share(blocks, expected) > 0.95
+        assert len(blocks) < len(Log(4).sent) / 20
+        assert expected[1][0]["other_source"] > 100
+
     def test_invalid_and_saturated_readings_are_nan_and_counted(self):
         log = Log(5)
         for place in log.chunks()[::3]:
@@ -315,8 +323,15 @@ def imus(log, at, n):
     """The autopilot sends what its own sensors read."""
     for place in range(len(log.sent) - 1, at, -5 - n):
         time_us = log.sent[place][0]
-        sent = {"time_boot_ms": (time_us - START_US) // 1000, "xgyro": place % 100}
-        log.sent.insert(place, (time_us, "SCALED_IMU", sent, AUTOPILOT))
+        messages = [
+            ("SCALED_IMU", {"time_boot_ms": (time_us - START_US) // 1000, "xgyro": place % 100}),
+            ("SCALED_IMU3", {}),
+            ("HIGHRES_IMU", {"time_usec": time_us - START_US, "zgyro": 1.0}),
+            ("RAW_IMU", {"time_usec": 1 << 63}),
+            ("DEBUG_FLOAT_ARRAY", {"time_usec": time_us - START_US, "name": "gyro"}),
+            ("DEBUG_FLOAT_ARRAY", {"time_usec": time_us - START_US, "name": "other"}),
+        ]
+        log.sent.insert(place, (time_us, *messages[place % len(messages)], AUTOPILOT))
 
 
 def jump(log, at, n):

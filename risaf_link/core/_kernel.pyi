@@ -133,17 +133,18 @@ class ArrayLayout:
     ) -> None: ...
 
 class EpochFinder:
-    def __init__(self, kinds: list[int]) -> None: ...
+    def __init__(self, kinds: list[int], jump_us: int, patience_us: int) -> None: ...
     def load(
         self, buffer: bytes, cuts: NDArray[np.uint8], times_us: NDArray[np.uint64]
     ) -> None: ...
     def take(
-        self, array: ArrayLayout, time_us: int, sequence: int, most: int
+        self, array: ArrayLayout, time_us: int, sequence: int, heard_us: int, most: int
     ) -> (
         tuple[
             tuple[NDArray[np.int64], Floats, Floats, Floats, NDArray[np.int64], NDArray[np.int64]],
             tuple[int, int, int, int],
             tuple[int, int],
+            list[int],
         ]
         | None
     ): ...

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from risaf_link.mavlink.choice import PATIENCE_US
 from risaf_link.mavlink.dialect import IDS
-from risaf_link.mavlink.epoch import EpochAssembler, GyroChunk, RegularEpochs, Source
+from risaf_link.mavlink.epoch import JUMP_US, EpochAssembler, GyroChunk, RegularEpochs, Source
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.gps import READERS
 from risaf_link.mavlink.ingest import NONE, ArrayInfo, Ingest
@@ -39,8 +40,9 @@ class Kind(IntEnum):
     IGNORED = 0  # nothing is read from it
     ASIDE = 1  # it has nothing to do with the array
     APART = 2  # it may change what the array's frames mean, or which array is listened to
-    GYROS = 3
-    FORCES = 4
+    REFUSED = 3  # it is not listened to while the array is heard
+    GYROS = 4
+    FORCES = 5
 
 
 class BlockReader:
@@ -58,7 +60,9 @@ class BlockReader:
         self._kinds = _kinds(ingest)
         self._layout: _kernel.ArrayLayout
         self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
-        self._finder = _kernel.EpochFinder(list(self._kinds)) if _kernel else None
+        self._finder: _kernel.EpochFinder | None = None
+        if _kernel:
+            self._finder = _kernel.EpochFinder(list(self._kinds), JUMP_US, PATIENCE_US)
 
     def read(
         self, table: FrameTable, times_us: Stamps
@@ -84,7 +88,7 @@ class BlockReader:
         self._finder.load(table.buffer, table.cuts.view(np.uint8), times_us)
         while True:
             most = self._assembler.until_review
-            block = self._block(times_us, most)
+            block = self._block(table, times_us, most)
             if block is not None:
                 yield block
                 if len(block) == most:
@@ -94,7 +98,7 @@ class BlockReader:
                 return
             yield table.frame(row), int(times_us[row])
 
-    def _block(self, times_us: Stamps, most: int) -> RegularEpochs | None:
+    def _block(self, table: FrameTable, times_us: Stamps, most: int) -> RegularEpochs | None:
         source, last = self._assembler.source, self._assembler.last
         if self._finder is None or source is None or last is None or last.sequence is None:
             return None
@@ -102,17 +106,18 @@ class BlockReader:
         if source != self._ingest.source or not self._assembler.is_steady(info.sensors):
             return None
         self._lay_out(source, info)
-        found = self._finder.take(self._layout, last.time_us, last.sequence, most)
+        heard_us = self._ingest.heard_us
+        found = self._finder.take(self._layout, last.time_us, last.sequence, heard_us, most)
         if found is None:
             return None
-        columns, (newest, begun, heard, sequence), unusable = found
+        columns, (newest, begun, heard, sequence), unusable, refused = found
         time_us = int(columns[0][-1])
         chunks = (
             GyroChunk(source, time_us, int(times_us[row]), 0, NONE, NONE, sequence, info.sensors)
             for row in (newest, begun)
         )
         block = RegularEpochs(*columns, *chunks)
-        self._ingest.take_block(int(times_us[heard]), *unusable)
+        self._ingest.take_block(int(times_us[heard]), *unusable, map(table.frame, refused))
         self._assembler.take_block(block)
         return block
 
@@ -134,6 +139,7 @@ def _kinds(ingest: Ingest) -> bytearray:
     """Kind of every message, by its id."""
     kinds = dict.fromkeys(ingest.message_ids, Kind.APART)
     aside = {IDS[name] for name in (*READERS, "HEARTBEAT", "SYSTEM_TIME")}
+    kinds |= dict.fromkeys(ingest.refused_ids, Kind.REFUSED)
     kinds |= dict.fromkeys(aside & {*ingest.message_ids, IDS["SYSTEM_TIME"]}, Kind.ASIDE)
     kinds |= {IDS["GYRO_ARRAY"]: Kind.GYROS, IDS["ACCEL_ARRAY"]: Kind.FORCES}
     by_id = bytearray(max(kinds) + 1)

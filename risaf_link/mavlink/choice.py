@@ -13,8 +13,8 @@ class Choice:
 
     def __init__(self) -> None:
         self.chosen: Hashable = None
+        self.heard_us = 0  # when it was, the last time
         self._rank: tuple[int, ...] = ()
-        self._heard_us = 0
 
     def admits(self, source: Hashable, rank: tuple[int, ...], now_us: int) -> bool:
         """Whether this source, which has just been heard, is the one to take.
@@ -29,16 +29,12 @@ class Choice:
             Arrival time.
         """
         if source != self.chosen:
-            is_silent = abs(now_us - self._heard_us) > PATIENCE_US
+            is_silent = abs(now_us - self.heard_us) > PATIENCE_US
             if self.chosen is not None and not is_silent and rank >= self._rank:
                 return False
             self.chosen, self._rank = source, rank
-        self.hear(now_us)
+        self.heard_us = now_us
         return True
-
-    def hear(self, now_us: int) -> None:
-        """Take note that the chosen source has been heard."""
-        self._heard_us = now_us
 
 
 class _Stream:

@@ -6,7 +6,7 @@ Bytes from outside never raise here: what cannot be used is counted by reason.
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, replace
 from typing import TypeVar, cast
 
@@ -154,12 +154,25 @@ class Ingest:
         return frozenset(self._readers)
 
     @property
+    def refused_ids(self) -> frozenset[int]:
+        """Of those that are not listened to while there is an array of our dialect."""
+        is_best = self._parameters.encodings[:1] == ("GYRO_ARRAY",)
+        return frozenset((*FINEST_FIRST, IDS["DEBUG_FLOAT_ARRAY"]) if is_best else ())
+
+    @property
     def source(self) -> Source | None:
         """The array that is listened to."""
         return cast("Source | None", self._arrays.chosen)
 
-    def take_block(self, heard_us: int, invalid: int, saturated: int) -> None:
-        """Take note of frames of this array that were read elsewhere.
+    @property
+    def heard_us(self) -> int:
+        """When its last gyros came."""
+        return self._arrays.heard_us
+
+    def take_block(
+        self, heard_us: int, invalid: int, saturated: int, refused: Iterable[Frame]
+    ) -> None:
+        """Take note of frames of the array that were read elsewhere.
 
         Parameters
         ----------
@@ -167,10 +180,14 @@ class Ingest:
             When the last one with gyros came.
         invalid, saturated : int
             Readings of one axis, as in `counts`.
+        refused : iterable of Frame
+            What came in between from sources that are less good and not listened to.
         """
-        self._arrays.hear(heard_us)
+        self._arrays.heard_us = heard_us
         self.counts["invalid"] += invalid
         self.counts["saturated"] += saturated
+        for frame in refused:
+            self.decode(frame, heard_us)
 
     def _admits(self, source: Source, time_us: int, received_us: int, has_gyros: bool) -> bool:
         """Whether samples are of the array that is listened to; gyros decide which one that is."""

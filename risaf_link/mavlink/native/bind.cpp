@@ -64,7 +64,8 @@ Array<T> made(std::initializer_list<std::size_t> shape) {
 // Whole epochs out of a table, as block.py wants them.
 class EpochFinder {
  public:
-  explicit EpochFinder(std::vector<std::uint8_t> kinds) : finder_(std::move(kinds)) {}
+  EpochFinder(std::vector<std::uint8_t> kinds, std::int64_t jump_us, std::uint64_t patience_us)
+      : finder_(std::move(kinds), jump_us, patience_us) {}
 
   void load(nb::bytes buffer, Column<std::uint8_t> cuts, Column<std::uint64_t> times_us) {
     const std::size_t size = times_us.shape(0);
@@ -79,9 +80,9 @@ class EpochFinder {
   }
 
   nb::object take(const risaf::ArrayLayout& array, std::int64_t time_us, std::uint16_t sequence,
-                  std::size_t most) {
+                  std::uint64_t heard_us, std::size_t most) {
     risaf::Clock clock{time_us, sequence};
-    const auto& epochs = finder_.take(array, &clock, most);
+    const auto& epochs = finder_.take(array, &clock, heard_us, most);
     const std::size_t size = epochs.size();
     if (size == 0) {
       return nb::none();
@@ -104,7 +105,8 @@ class EpochFinder {
     return nb::make_tuple(nb::make_tuple(times, dt, rates, forces, received, rows),
                           nb::make_tuple(last.newest, last.begun, last.heard, clock.sequence),
                           nb::make_tuple(of_gyros.invalid + of_accels.invalid,
-                                         of_gyros.saturated + of_accels.saturated));
+                                         of_gyros.saturated + of_accels.saturated),
+                          finder_.refused());
   }
 
   std::size_t single() { return finder_.single(); }
@@ -130,8 +132,10 @@ void bind_frames(nb::module_& m) {
       .def(nb::init<std::uint8_t, std::uint8_t, std::uint8_t, risaf::Sensors, risaf::Sensors>(),
            "system"_a, "component"_a, "array_id"_a, "gyros"_a, "accels"_a);
   nb::class_<EpochFinder>(m, "EpochFinder")
-      .def(nb::init<std::vector<std::uint8_t>>(), "kinds"_a)
+      .def(nb::init<std::vector<std::uint8_t>, std::int64_t, std::uint64_t>(), "kinds"_a,
+           "jump_us"_a, "patience_us"_a)
       .def("load", &EpochFinder::load, "buffer"_a, "cuts"_a, "times_us"_a)
-      .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a, "most"_a)
+      .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a,
+           "heard_us"_a, "most"_a)
       .def("single", &EpochFinder::single);
 }

@@ -16,7 +16,8 @@
 
 namespace risaf {
 
-enum Kind : std::uint8_t { IGNORED, ASIDE, APART, GYROS, FORCES };  // of a message: `Kind` in block.py
+// Of a message: `Kind` in block.py.
+enum Kind : std::uint8_t { IGNORED, ASIDE, APART, REFUSED, GYROS, FORCES };
 
 // Sensors of one kind.
 struct Sensors {
@@ -46,11 +47,14 @@ struct Unusable {
 
 class EpochFinder {
  public:
-  static constexpr std::int64_t JUMP_US = 1'000'000, LATEST_US = std::int64_t{1} << 62;
+  static constexpr std::int64_t LATEST_US = std::int64_t{1} << 62;
   static constexpr std::size_t HEAD = 12, COUNT = 252, ARRAY_ID = 253, CAPACITY = 40;
   static constexpr std::int16_t INVALID = -32768;
 
-  explicit EpochFinder(std::vector<std::uint8_t> kinds) : kinds_(std::move(kinds)) {}
+  // `kinds` by message id; `jump_us`: a step that is no usual one; `patience_us`: for how long an
+  // array may be silent without another being listened to.
+  EpochFinder(std::vector<std::uint8_t> kinds, std::int64_t jump_us, std::uint64_t patience_us)
+      : kinds_(std::move(kinds)), jump_us_(jump_us), patience_us_(patience_us) {}
 
   // Begin with a table, which must outlive its use.
   void load(const std::uint8_t* buffer, const Cut* cuts, const std::uint64_t* times_us,
@@ -65,9 +69,11 @@ class EpochFinder {
 
   // Take whole epochs, up to the first frame that is not as usual, or that must be handed on between
   // two of them. They stay known until the next call; `clock` is that of the last one, then.
-  const std::vector<EpochRows>& take(const ArrayLayout& array, Clock* clock, std::size_t most) {
+  const std::vector<EpochRows>& take(const ArrayLayout& array, Clock* clock,
+                                     std::uint64_t heard_us, std::size_t most) {
     epochs_.clear();
     chunks_.clear();
+    refused_.clear();
     aside_ = NOWHERE;
     EpochRows epoch{};
     Clock now = *clock;
@@ -77,17 +83,21 @@ class EpochFinder {
       if (kind == IGNORED || (kind == ASIDE && row < handed_)) {
         continue;
       }
+      if (kind == REFUSED && apart(times_us_[row], heard_us) <= patience_us_) {
+        refused_.push_back(row);
+        continue;
+      }
       Chunk chunk;
       if (kind == ASIDE) {
         aside_ = row;
       }
-      if (kind == ASIDE || kind == APART || !read(array, row, kind == GYROS, &chunk)) {
+      if (kind < GYROS || !read(array, row, kind == GYROS, &chunk)) {
         break;
       }
       std::size_t& come = chunk.is_gyro ? gyros : forces;
       const bool is_first = gyros + forces == 0;
       const std::int64_t step_us = chunk.clock.time_us - clock->time_us;
-      if (chunk.first != come || (is_first ? step_us <= 0 || step_us > JUMP_US
+      if (chunk.first != come || (is_first ? step_us <= 0 || step_us > jump_us_
                                            : chunk.clock.time_us != epoch.time_us)) {
         break;
       }
@@ -105,6 +115,7 @@ class EpochFinder {
           now = chunk.clock;
         }
         epoch.heard = row;
+        heard_us = times_us_[row];
       }
       come += chunk.count;
       chunk.epoch = epochs_.size();
@@ -119,8 +130,14 @@ class EpochFinder {
       }
     }
     chunks_.resize(whole_chunks);
+    while (!refused_.empty() && refused_.back() >= at_) {
+      refused_.pop_back();
+    }
     return epochs_;
   }
+
+  // What stood between the epochs that were taken and is not listened to.
+  const std::vector<std::size_t>& refused() const { return refused_; }
 
   // Readings of the epochs that were taken, (epochs, sensors, 3).
   Unusable read(const Sensors& sensors, bool is_gyro, double* values) const {
@@ -159,6 +176,8 @@ class EpochFinder {
     Clock clock;
     const std::uint8_t* readings;
   };
+
+  static std::uint64_t apart(std::uint64_t a, std::uint64_t b) { return a > b ? a - b : b - a; }
 
   Kind kind_of(std::size_t row) const {
     const std::uint32_t message_id = cuts_[row].message_id;
@@ -219,7 +238,9 @@ class EpochFinder {
     }
   }
 
-  std::vector<std::uint8_t> kinds_;  // by message id
+  std::vector<std::uint8_t> kinds_;
+  std::int64_t jump_us_;
+  std::uint64_t patience_us_;
   const std::uint8_t* buffer_ = nullptr;
   const Cut* cuts_ = nullptr;
   const std::uint64_t* times_us_ = nullptr;
@@ -229,6 +250,7 @@ class EpochFinder {
   std::size_t aside_ = NOWHERE;  // where `take` has stopped, if at such a frame
   std::vector<EpochRows> epochs_;
   std::vector<Chunk> chunks_;
+  std::vector<std::size_t> refused_;
 };
 
 }  // namespace risaf
