@@ -24,7 +24,7 @@ from pymavlink import mavutil
 
 from risaf_link.links.file import read
 from risaf_link.mavlink.block import BlockReader
-from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, EpochBlock, GyroChunk
+from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk, RegularEpochs
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.ingest import GpsParameters, Ingest
 from risaf_link.mavlink.tlog import TlogReader
@@ -56,7 +56,7 @@ def epochs(path: Path) -> int:
     blocks = BlockReader(decoder.ingest, decoder.assembler)
     for table, times_us in TlogReader(read(path)).tables():
         for item in blocks.read(table, times_us):
-            if not isinstance(item, EpochBlock):
+            if not isinstance(item, RegularEpochs):
                 decoder.step(*item)
     return decoder.assembler.counts["epochs"]
 

@@ -41,7 +41,12 @@ class Log:
         self.shape = (gyros, accels, part, forces_first)
         self.sent = [sent for k in range(epochs) for sent in self.epoch(k)]
 
-    def epoch(self, k, sender=ARRAY):
+    def epoch(self, k):
+        """Frames of an epoch and around it, one after another."""
+        for place, (time_us, *sent) in enumerate(self.frames(k)):
+            yield time_us + 40 * place, *sent
+
+    def frames(self, k, sender=ARRAY):
         gyros, accels, part, forces_first = self.shape
         time_us = START_US + k * PERIOD_US
         if k % 100 == 0:
@@ -64,9 +69,7 @@ class Log:
 
     def chunks(self):
         """Places of the array's frames."""
-        return [
-            i for i, sent in enumerate(self.sent) if "ARRAY" in sent[1] and "INFO" not in sent[1]
-        ]
+        return [i for i, sent in enumerate(self.sent) if sent[1] in ("GYRO_ARRAY", "ACCEL_ARRAY")]
 
     def raw(self):
         return b"".join(record(sent[0], framed(*sent[1:])) for sent in self.sent)
@@ -331,7 +334,7 @@ def imus(log, at, n):
             ("DEBUG_FLOAT_ARRAY", {"time_usec": time_us - START_US, "name": "gyro"}),
             ("DEBUG_FLOAT_ARRAY", {"time_usec": time_us - START_US, "name": "other"}),
         ]
-        log.sent.insert(place, (time_us, *messages[place % len(messages)], AUTOPILOT))
+        log.sent.insert(place, (time_us, *messages[log.random.integers(len(messages))], AUTOPILOT))
 
 
 def jump(log, at, n):
@@ -370,6 +373,12 @@ def garble(log, at, n):
     log.sent[place] = (time_us, name, (array_us, k, first, size, counts), sender)
 
 
+def begun_at(log, at):
+    """Where an epoch begins, at a place or behind it."""
+    numbers = {i: log.sent[i][2][1] for i in log.chunks() if i >= at}
+    return next(i for i, k in numbers.items() if k != numbers[min(numbers)])
+
+
 SPOILERS = [
     *(lose, double, swap, delay, silence, silence_forces, slow_forces, resize, tell),
     *(be_silent_of_itself, another, imus, jump, jump_once, jump_number, jump_arrival, garble),
@@ -380,10 +389,20 @@ class TestSpoiled:
     @pytest.mark.parametrize("n", range(1, 5))
     @pytest.mark.parametrize("spoil", SPOILERS)
     def test_in_one_way(self, spoil, n):
-        random = seeded(n)
         log = Log(n, 260, forces_first=n % 2 == 0)
-        spoil(log, random.randrange(600, 1000), n)
+        at = seeded(n).randrange(600, 1000)
+        spoil(log, begun_at(log, at) if n % 2 else at, n)
         assert_same(log, (1 << 20, 4_000))
+
+    @pytest.mark.parametrize("n", range(4))
+    def test_by_an_autopilot_that_is_heard_when_the_array_has_been_silent(self, n):
+        log = Log(n, 260)
+        imus(log, 0, n)
+        names = [sent[1] for sent in log.sent]
+        jump_arrival(log, names.index("HIGHRES_IMU", 700), n)
+        (_, (unused, assembly), _), _ = assert_same(log)
+        assert (assembly["source_changes"] > 0) == (n != 1)
+        assert unused["other_source"] > 50
 
     @settings(max_examples=100)
     @given(
