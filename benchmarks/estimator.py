@@ -11,22 +11,28 @@ over the whole run; and the mean normalised innovation squared of the headings t
 
 import argparse
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 import numpy as np
 
 from risaf_link.config import load
-from risaf_link.core.rotation import Floats, euler_from_quaternion
-from risaf_link.mavlink.frame import FrameParser
+from risaf_link.core.estimate import EstimateBlock
+from risaf_link.core.fusion import EpochBlock
+from risaf_link.core.rotation import euler_from_quaternion, eulers_of, wraps
+from risaf_link.core.track import Track
+from risaf_link.mavlink.block import BlockReader
+from risaf_link.mavlink.frame import FrameTable
+from risaf_link.mavlink.tlog import Stamps, TlogReader, record
 from risaf_link.mavlink.truth import truth_of
 from risaf_link.pipeline import Pipeline
 from risaf_link.sim.scenario import BOOT_US, scenario
-from risaf_link.sim.stream import frames
+from risaf_link.sim.stream import frames, record_time_us
 
 METHODS = ("robust", "risaf", "median", "mean")
 Row = tuple[float, float, float, float, float]  # rmse and tilt, deg; error over sigma; NIS
+Tables = Sequence[tuple[FrameTable, Stamps]]
 
 
 def run(
@@ -35,50 +41,54 @@ def run(
     """Run one seed with one choice of faults through every method."""
     seed, faults = case
     chosen = scenario(name, seed, faults=faults.split(","))
-    configs = [load(None, [f"fusion.method={method}", *settings]) for method in methods]
-    pipelines = [Pipeline(config, config.own) for config in configs]
-    estimates: list[dict[int, Floats]] = [{} for _ in pipelines]
-    truths: dict[int, Floats] = {}
-    nis: list[list[float]] = [[] for _ in pipelines]
-    fused = [0] * len(pipelines)
-    parser = FrameParser()
-    for time_us, raw in frames(chosen):
-        for frame in parser.receive_data(raw):
+    log = [record(record_time_us(time_us), raw) for time_us, raw in frames(chosen)]
+    tables = list(TlogReader([b"".join(log)]).tables())
+    truths = dict(_truths(tables))
+    outages = chosen.outages or ((0.0, math.inf),)
+    rows = {}
+    for method in methods:
+        config = load(None, [f"fusion.method={method}", *settings])
+        blocks = list(_blocks(Pipeline(config, config.own), tables))
+        rows[method] = _score(blocks, truths, outages[-1])
+    return rows
+
+
+def _blocks(pipeline: Pipeline, tables: Tables) -> Iterator[EstimateBlock]:
+    reader = BlockReader(pipeline.ingest, pipeline.assembler)
+    for table, times_us in tables:
+        for item in reader.read(table, times_us):
+            if isinstance(item, EpochBlock):
+                yield from pipeline.advance(item)
+            else:
+                yield from pipeline.gather(*item)
+    yield from pipeline.flush(0)
+
+
+def _truths(tables: Tables) -> Iterator[tuple[int, tuple[float, float, float]]]:
+    """Time of each true attitude, us, and its angles."""
+    for table, _ in tables:
+        for frame in map(table.frame, range(len(table))):
             truth = truth_of(frame)
             if truth is not None and truth.time_us is not None:
-                truths[truth.time_us] = truth.q_nb
-            for i, pipeline in enumerate(pipelines):
-                for estimate in pipeline.step(frame, time_us):
-                    attitude, heading = estimate.attitude, estimate.heading
-                    if heading.fused_count > fused[i] and heading.innovation:
-                        fused[i] = heading.fused_count
-                        if not heading.innovation.reset:
-                            nis[i].append(heading.innovation.value**2 / heading.innovation.variance)
-                    if attitude.aligned:
-                        stds = (attitude.roll_std, attitude.pitch_std, attitude.yaw_std)
-                        estimates[i][estimate.time_us] = np.array([*attitude.q_nb, *stds])
-    outages = chosen.outages or ((0.0, math.inf),)
-    return {
-        method: _score(estimates[i], truths, outages[-1], nis[i])
-        for i, method in enumerate(methods)
-    }
+                yield truth.time_us, euler_from_quaternion(truth.q_nb)
 
 
 def _score(
-    estimates: dict[int, Floats],
-    truths: dict[int, Floats],
+    blocks: list[EstimateBlock],
+    truths: dict[int, tuple[float, float, float]],
     outage: tuple[float, float],
-    nis: list[float],
 ) -> Row:
-    times = sorted(estimates.keys() & truths.keys())
-    estimated = np.array([estimates[time] for time in times])
-    euler = np.array([euler_from_quaternion(q) for q in estimated[:, :4]])
-    truth = np.array([euler_from_quaternion(truths[time]) for time in times])
-    error = (euler - truth + math.pi) % (2 * math.pi) - math.pi
-    since = (np.array(times) - BOOT_US) / 1e6
+    time_us = np.concatenate([block.time_us for block in blocks])
+    values = np.concatenate([block.track.values for block in blocks])
+    track = Track(values)
+    true = np.array([truths.get(time, (np.nan,) * 3) for time in time_us.tolist()])
+    known = track.aligned & np.isfinite(true[:, 0])
+    error = wraps(eulers_of(track.q_nb[known]).T - true[known])
+    since = (time_us[known] - BOOT_US) / 1e6
     inside = (outage[0] <= since) & (since < outage[1])
-    ratio = np.sqrt(((error / estimated[:, 4:]) ** 2).mean(axis=0))
+    ratio = np.sqrt(((error / track.angle_std[known]) ** 2).mean(axis=0))
     rmse = np.degrees(np.sqrt((error[inside] ** 2).mean(axis=0)))
+    nis = _nis(blocks)
     return (
         float(rmse[2]),
         float(rmse[:2].max()),
@@ -86,6 +96,16 @@ def _score(
         float(ratio[2]),
         float(np.mean(nis)) if nis else math.nan,
     )
+
+
+def _nis(blocks: list[EstimateBlock]) -> list[float]:
+    """Normalised innovations squared of the headings that were fused."""
+    found, count = [], 0
+    for heading in (block.heading for block in blocks):
+        fresh, count = heading.fused_count > count, heading.fused_count
+        if fresh and heading.innovation and not heading.innovation.reset:
+            found.append(heading.innovation.value**2 / heading.innovation.variance)
+    return found
 
 
 def main() -> None:

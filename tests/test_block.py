@@ -326,13 +326,14 @@ def imus(log, at, n):
     """The autopilot sends what its own sensors read."""
     for place in range(len(log.sent) - 1, at, -5 - n):
         time_us = log.sent[place][0]
+        boot_us = max(time_us - START_US, 0)
         messages = [
-            ("SCALED_IMU", {"time_boot_ms": (time_us - START_US) // 1000, "xgyro": place % 100}),
+            ("SCALED_IMU", {"time_boot_ms": boot_us // 1000, "xgyro": place % 100}),
             ("SCALED_IMU3", {}),
-            ("HIGHRES_IMU", {"time_usec": time_us - START_US, "zgyro": 1.0}),
+            ("HIGHRES_IMU", {"time_usec": boot_us, "zgyro": 1.0}),
             ("RAW_IMU", {"time_usec": 1 << 63}),
-            ("DEBUG_FLOAT_ARRAY", {"time_usec": time_us - START_US, "name": "gyro"}),
-            ("DEBUG_FLOAT_ARRAY", {"time_usec": time_us - START_US, "name": "other"}),
+            ("DEBUG_FLOAT_ARRAY", {"time_usec": boot_us, "name": "gyro"}),
+            ("DEBUG_FLOAT_ARRAY", {"time_usec": boot_us, "name": "other"}),
         ]
         log.sent.insert(place, (time_us, *messages[log.random.integers(len(messages))], AUTOPILOT))
 
