@@ -23,6 +23,7 @@ class RobustParameters:
     spread_time: float
     frozen_after: float
     silent_after: float
+    dead_after: float
     relearn: float
     tiny: float
     least_white: float
@@ -56,8 +57,7 @@ class Risaf(_Fusion):
 
 class Robust(_Fusion):
     def __init__(self, parameters: RobustParameters) -> None: ...
-    def channels(self) -> dict[str, Floats]: ...
-    def trusted(self) -> Floats: ...
+    def health(self) -> tuple[NDArray[np.int8], NDArray[np.int8], Floats, Floats]: ...
 
 Told = tuple[float, float, float, bool, int, int]
 

@@ -30,7 +30,7 @@ BUILT = _kernel is not None
 
 _SHARED = (
     *("LIMIT", "LONGEST", "WATCH_TIME", "BURST_TIME", "BURST", "SWELL", "NOISE_TIME"),
-    *("SPREAD_TIME", "FROZEN_AFTER", "RELEARN", "TINY", "LEAST_WHITE", "PRIOR"),
+    *("SPREAD_TIME", "FROZEN_AFTER", "DEAD_AFTER", "RELEARN", "TINY", "LEAST_WHITE", "PRIOR"),
 )
 
 
@@ -105,15 +105,11 @@ class _Robust:
     @property
     def relative_bias(self) -> Floats:
         """Relative bias of each sensor, shape (n, 3), rad/s."""
-        return self._channels.bias.T
+        return self.kernel.health()[3]
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch; of a sensor, its worst axis counts."""
-        return robust.judge(self._channels, self.kernel.trusted() > 0.0)
-
-    @property
-    def _channels(self) -> robust.Channels:
-        return robust.Channels(**self.kernel.channels())
+        return ArrayHealth(*self.kernel.health())
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""

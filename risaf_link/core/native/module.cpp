@@ -44,32 +44,14 @@ Array<double> by_axis(std::size_t n, RowOf row) {
   return owned(values, {3, n});
 }
 
-// What is remembered of each channel under a name, shape (3, n).
-Array<double> channels(const risaf::Robust& robust, risaf::Row risaf::Robust::Axis::*member) {
-  return by_axis(robust.sensors(),
-                 [&](std::size_t k) -> const risaf::Row& { return robust.axis(k).*member; });
-}
-
-// All that is remembered, by the names of `Channels`.
-nb::dict all_channels(const risaf::Robust& robust) {
-  using Axis = risaf::Robust::Axis;
-  nb::dict all;
-  all["reading"] = channels(robust, &Axis::reading);
-  all["count"] = channels(robust, &Axis::count);
-  all["residual"] = channels(robust, &Axis::residual);
-  all["bias"] = channels(robust, &Axis::bias);
-  all["age"] = channels(robust, &Axis::age);
-  all["slow"] = channels(robust, &Axis::slow);
-  all["rejected"] = channels(robust, &Axis::rejected);
-  all["unchanged"] = channels(robust, &Axis::unchanged);
-  all["moved"] = channels(robust, &Axis::moved);
-  all["frozen"] = channels(robust, &Axis::frozen);
-  all["silent"] = channels(robust, &Axis::silent);
-  all["calm"] = channels(robust, &Axis::calm);
-  all["out"] = channels(robust, &Axis::out);
-  all["outlying"] = channels(robust, &Axis::outlying);
-  all["wandering"] = channels(robust, &Axis::wandering);
-  return all;
+// State, reason and share of rejected readings of each sensor, (n,), and its bias, (n, 3).
+nb::tuple health(const risaf::Robust& robust) {
+  const std::size_t n = robust.sensors();
+  auto *state = new std::int8_t[n], *reason = new std::int8_t[n];
+  auto *rejected = new double[n], *bias = new double[3 * n];
+  robust.health(state, reason, rejected, bias);
+  return nb::make_tuple(owned(state, {n}), owned(reason, {n}), owned(rejected, {n}),
+                        owned(bias, {n, 3}));
 }
 
 Array<double> relative_bias(const risaf::Risaf& fusion) {
@@ -118,6 +100,7 @@ NB_MODULE(_kernel, m) {
   field("spread_time", &risaf::RobustParameters::spread_time);
   field("frozen_after", &risaf::RobustParameters::frozen_after);
   field("silent_after", &risaf::RobustParameters::silent_after);
+  field("dead_after", &risaf::RobustParameters::dead_after);
   field("relearn", &risaf::RobustParameters::relearn);
   field("tiny", &risaf::RobustParameters::tiny);
   field("least_white", &risaf::RobustParameters::least_white);
@@ -137,10 +120,7 @@ NB_MODULE(_kernel, m) {
       .def("relative_bias", &relative_bias);
   fusion<risaf::Robust>(m, "Robust")
       .def(nb::init<risaf::RobustParameters>())
-      .def("channels", &all_channels)
-      .def("trusted", [](const risaf::Robust& robust) {
-        return channels(robust, &risaf::Robust::Axis::trusted);
-      });
+      .def("health", &health);
 
   bind_filter(m);
   bind_frames(m);

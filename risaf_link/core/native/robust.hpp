@@ -19,9 +19,13 @@ struct RobustParameters {
   double gate, bias_time, hold_time, resolution, scale_error, gyro_noise, bias_walk;
   // Constants of robust.py, told by it.
   double limit, longest, watch_time, burst_time, burst, swell, noise_time, spread_time;
-  double frozen_after, silent_after, relearn, tiny, least_white, prior;
+  double frozen_after, silent_after, dead_after, relearn, tiny, least_white, prior;
   std::vector<double> mad_factors;
 };
+
+// As `SensorState` and `Reason` of health.py.
+enum SensorState : std::int8_t { HEALTHY, SUSPECT, DEAD };
+enum Reason : std::int8_t { NONE, SETTLING, WANDERING, OUTLYING, FROZEN, SILENT };
 
 class Robust {
  public:
@@ -70,6 +74,30 @@ class Robust {
     return static_cast<std::int64_t>(risaf::count(length(), [this](std::size_t i) {
       return axes_[0].valid[i] * axes_[1].valid[i] * axes_[2].valid[i] > 0.0;
     }));
+  }
+
+  // `judge` of robust.py: of each sensor, by its worst axis, and its bias (n, 3).
+  void health(std::int8_t* state, std::int8_t* reason, double* rejected, double* bias) const {
+    for (std::size_t i = 0; i < n_; ++i) {
+      Reason worst = NONE;
+      bool dead = false;
+      rejected[i] = 0.0;
+      for (std::size_t k = 0; k < 3; ++k) {
+        const Axis& a = axes_[k];
+        const Reason found = a.silent[i] > 0.0      ? SILENT
+                             : a.frozen[i] > 0.0    ? FROZEN
+                             : a.outlying[i] > 0.0  ? OUTLYING
+                             : a.wandering[i] > 0.0 ? WANDERING
+                             : a.trusted[i] > 0.0   ? NONE
+                                                    : SETTLING;
+        worst = std::max(worst, found);
+        dead |= a.frozen[i] > 0.0 || a.silent[i] > p.silent_after || a.out[i] > p.dead_after;
+        rejected[i] = std::max(rejected[i], a.rejected[i]);
+        bias[3 * i + k] = a.bias[i];
+      }
+      reason[i] = worst;
+      state[i] = dead ? DEAD : worst > NONE ? SUSPECT : HEALTHY;
+    }
   }
 
  private:
