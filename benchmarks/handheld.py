@@ -198,7 +198,7 @@ def by_eskf(one: Trial) -> Floats:
     estimator = Estimator(FusionParameters(), AttitudeParameters(), HeadingParameters())
     dt = np.full(len(one.rates_b), 1.0 / RATE)
     dt[0] = 0.0
-    track = estimator.advance(dt, one.rates_b[:, np.newaxis], one.forces_b[:, np.newaxis])
+    track, _ = estimator.advance(dt, one.rates_b[:, np.newaxis], one.forces_b[:, np.newaxis])
     return matrix_from_quaternion(track.q_nb)[:, 2]
 
 

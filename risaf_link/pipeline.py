@@ -9,7 +9,6 @@ that a live run that is recorded and replayed gives the same estimates, bit for 
 
 from itertools import groupby
 
-import numpy as np
 from msgspec import Struct, field, structs
 
 from risaf_link.core.array import ArrayCalibration, Calibration
@@ -76,7 +75,6 @@ class Pipeline:
         self._judged = 0.0  # s, when it was made
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
-        self._elapsed = 0.0  # s, of epochs
         self._waiting: list[tuple[Epoch, int]] = []
 
     def step(self, frame: Frame, received_us: int) -> list[Estimate]:
@@ -134,23 +132,20 @@ class Pipeline:
         rates_b, forces_b = epochs.rates_b, epochs.forces_b
         if self._calibration:
             rates_b, forces_b = self._calibration.apply(rates_b, forces_b)
-        track = self._estimator.advance(epochs.dt, rates_b, forces_b)
-        elapsed = np.cumsum(np.concatenate(([self._elapsed], epochs.dt)))[1:]
-        self._elapsed = float(elapsed[-1])
-        times = zip(epochs.time_us.tolist(), epochs.received_us.tolist(), strict=True)
+        track, elapsed = self._estimator.advance(epochs.dt, rates_b, forces_b)
         return EstimateBlock(
             epochs.time_us,
             epochs.received_us,
-            np.array([self._clock.boot_us(*time) for time in times]),
+            self._clock.boot_times(epochs.time_us, epochs.received_us),
             elapsed,
             track,
-            self._monitor.advance(epochs.dt, track.aligned),
+            self._monitor.advance(elapsed, track.aligned),
             self._array_status(sensors),
         )
 
     def _correct(self, fix: GpsFix) -> None:
         """Correct the attitude by a GPS fix."""
-        motion = self._finder.take(fix, self._elapsed)
+        motion = self._finder.take(fix, self._estimator.elapsed)
         self._monitor.note_motion(motion)
         innovation = self._estimator.correct(motion, fix.latitude)
         if innovation and motion.heading:
@@ -169,9 +164,9 @@ class Pipeline:
 
     def _judge(self, sensors: int) -> ArrayHealth:
         """Standing of the sensors, judged anew now and then."""
-        due = self._elapsed - self._judged >= HEALTH_PERIOD
-        if due or len(self._health.state) != sensors:
-            self._health, self._judged = self._estimator.fusion.health(), self._elapsed
+        now = self._estimator.elapsed
+        if now - self._judged >= HEALTH_PERIOD or len(self._health.state) != sensors:
+            self._health, self._judged = self._estimator.fusion.health(), now
         return self._health
 
     def _fits(self, sensors: int) -> bool:

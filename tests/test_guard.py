@@ -91,7 +91,7 @@ class Ride:
             force_b = np.array([gain, rate * self.speed, -GRAVITY])
             fused = FusedRate(0, NONE, NONE, np.zeros(3, np.int64), 1, NONE, NONE)
             track = Track.of([(fused, self.filter.state(0), force_b)])
-            self.guard.advance(track, np.array([DT]))
+            self.guard.advance(track, np.array([self.time]), np.array([DT]))
             self.state = track.attitude(0, 0)
             self.late.append((self.time, self.fix(rate)))
             if gps and round(self.time / DT) % 10 == 0:

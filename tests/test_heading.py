@@ -276,11 +276,12 @@ class Account:
 
     def __init__(self):
         self.monitor = HeadingMonitor(HeadingParameters(timeout=2.0))
-        self.resets = 0
+        self.resets, self.elapsed = 0, 0.0
 
     def wait(self, seconds, dt=0.1):
         for _ in range(round(seconds / dt)):
-            self.monitor.advance(np.array([dt]), np.array([self.resets > 0]))
+            self.elapsed += dt
+            self.monitor.advance(np.array([self.elapsed]), np.array([self.resets > 0]))
 
     def fix(self, motion, innovation=None):
         self.monitor.note_motion(motion)
@@ -299,7 +300,8 @@ class Account:
         attitude = AttitudeState(
             7, zeros(4) + 0.5, zeros(3), zeros(3), 0.1, 0.1, 0.2, self.resets > 0, self.resets
         )
-        return self.monitor.advance(zeros(1), np.array([attitude.aligned])).at(0, attitude)
+        now, aligned = np.array([self.elapsed]), np.array([attitude.aligned])
+        return self.monitor.advance(now, aligned).at(0, attitude)
 
     @property
     def state(self):

@@ -3,6 +3,9 @@
 WGS 84: NIMA TR8350.2, third edition, 2000.
 """
 
+import math
+from typing import Any
+
 import numpy as np
 
 from risaf_link.core.rotation import Floats
@@ -28,7 +31,8 @@ def radii(latitude: Floats | float, altitude: Floats | float = 0.0) -> tuple[Flo
     north, east : ndarray
         m/rad of latitude, and of longitude.
     """
-    flattening = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
-    normal = EQUATORIAL_RADIUS / np.sqrt(flattening)
+    m: Any = math if isinstance(latitude, float) else np
+    flattening = 1.0 - ECCENTRICITY_SQUARED * m.sin(latitude) ** 2
+    normal = EQUATORIAL_RADIUS / m.sqrt(flattening)
     meridian = normal * (1.0 - ECCENTRICITY_SQUARED) / flattening
-    return meridian + altitude, (normal + altitude) * np.cos(latitude)
+    return meridian + altitude, (normal + altitude) * m.cos(latitude)

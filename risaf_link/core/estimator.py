@@ -41,6 +41,8 @@ class Estimator:
     Attributes
     ----------
     fusion : Fusion
+    elapsed : float
+        Time of the last epoch, s.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class Estimator:
     ) -> None:
         self.fusion = FUSIONS[fusion.method](fusion)
         self._force_fusion = kernel.Robust(structs.replace(fusion, resolution=FORCE_RESOLUTION))
+        self.elapsed = 0.0
         self._delay = heading.delay
         self._filter: kernel.Eskf | PaperFilter
         if attitude.filter == "eskf":
@@ -57,8 +60,8 @@ class Estimator:
         self._aiding = kernel.Aiding(attitude)  # of the Eskf
         self._guard = HeadingGuard(heading, not isinstance(self._filter, PaperFilter))
 
-    def advance(self, dt: Floats, rates_b: Floats, forces_b: Floats) -> Track:
-        """Carry the estimate on over k epochs.
+    def advance(self, dt: Floats, rates_b: Floats, forces_b: Floats) -> tuple[Track, Floats]:
+        """Carry the estimate on over k epochs, at least one.
 
         Parameters
         ----------
@@ -66,6 +69,12 @@ class Estimator:
             Seconds, each since the epoch before.
         rates_b, forces_b : ndarray, shapes (k, n, 3) and (k, m, 3)
             rad/s and m/s^2; NaN where not valid. m may be 0.
+
+        Returns
+        -------
+        track : Track
+        elapsed : ndarray, shape (k,)
+            Time of each epoch, s.
         """
         parts = self.fusion, self._force_fusion, self._filter, self._aiding
         values = kernel.advance(*parts, dt, rates_b, forces_b)
@@ -74,8 +83,10 @@ class Estimator:
             track = Track.of([self._step(Epoch(0, *step, 0)) for step in steps])
         else:
             track = Track(values)
-        self._guard.advance(track, dt)
-        return track
+        elapsed: Floats = np.concatenate(((self.elapsed,), dt)).cumsum()[1:]
+        self.elapsed = float(elapsed[-1])
+        self._guard.advance(track, elapsed, dt)
+        return track, elapsed
 
     def _step(self, epoch: Epoch) -> tuple[FusedRate, AttitudeState, Floats]:
         """One epoch; this is what the kernel does as well."""

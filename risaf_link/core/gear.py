@@ -8,7 +8,6 @@ the change of speed, with the gear's sign.
 
 import numpy as np
 
-from risaf_link.core.earth import GRAVITY
 from risaf_link.core.rotation import Floats
 
 STANDING_SPEED = 0.5  # m/s; GPS shows half of it where nothing moves
@@ -42,15 +41,15 @@ class Gear:
         self._lately = 0.0  # and in the window that is not over
         self._right = 0.0  # evidence before, that yaw is not off by half a turn
 
-    def feel(self, q_nb: Floats, force_b: Floats, dt: Floats) -> None:
-        """Use the specific force of k epochs, (k, 3) m/s^2; NaN: there is no accelerometer."""
-        w, x, y, z = q_nb.T
-        along = force_b[:, 0] + GRAVITY * 2.0 * (x * z - w * y)
-        felt = np.abs(along) < LARGEST_FORCE
-        gained = np.where(felt, along * dt, 0.0)
-        self._felt = float(np.cumsum(np.concatenate(([self._felt], gained)))[-1])
-        if not felt.all():
-            self._begun = None
+    def feel(self, ahead: Floats, dt: Floats) -> None:
+        """Use what k epochs felt ahead, (k,) m/s^2; NaN: there is no accelerometer."""
+        felt = np.abs(ahead) < LARGEST_FORCE
+        if felt.all():
+            gained = ahead * dt
+        else:
+            gained, self._begun = np.where(felt, ahead * dt, 0.0), None
+        for gain in gained.tolist():
+            self._felt += gain
 
     def hear(self, speed: float, speed_std: float, time_s: float) -> None:
         """Use a speed over ground, m/s, with its standard deviation."""

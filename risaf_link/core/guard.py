@@ -163,24 +163,21 @@ class HeadingGuard:
         self._dispute = Dispute(LONGEST_DEFENCE * parameters.reset_after)
         self._elapsed = 0.0  # s
         self._last = -math.inf  # s, when the last heading came
-        self._turned: deque[tuple[float, Floats]] = deque([(0.0, np.zeros(3))], maxlen=RATES)
+        self._turned = np.zeros((1, 4))  # rad, the rate's integral in body axes; s
         self._aligned = False
         self._confirmed = 0.0  # s for which headings have agreed with yaw
 
-    def advance(self, track: Track, dt: Floats) -> None:
-        """Take note of k epochs and the time of each, (k,) s.
+    def advance(self, track: Track, elapsed: Floats, dt: Floats) -> None:
+        """Take note of k epochs: the time of each, s, and since the one before, (k,).
 
         The track is given the doubt about yaw that headings have left, which no filter knows of.
         """
-        if not len(track):
-            return
-        elapsed = np.cumsum(np.concatenate(([self._elapsed], dt)))
-        turns = np.vstack((self._turned[-1][1], track.rate_b * dt[:, np.newaxis]))
-        turned = np.cumsum(turns, axis=0)
-        self._turned.extend(zip(elapsed[1:].tolist(), turned[1:], strict=True))
+        turns = np.vstack((self._turned[-1, :3], track.rate_b * dt[:, np.newaxis]))
+        fresh = np.column_stack((turns.cumsum(axis=0)[1:], elapsed))
+        self._turned = np.vstack((self._turned[-RATES:], fresh))
         self._elapsed = float(elapsed[-1])
         self._aligned = bool(track.aligned[-1])
-        self.gear.feel(track.q_nb, track.force_b, dt)
+        self.gear.feel(track.ahead, dt)
         if self._whiteness.doubt:
             doubted = np.hypot(track.yaw_std, self._whiteness.doubt)
             track.yaw_std[:] = np.minimum(doubted, math.pi)
@@ -313,18 +310,16 @@ class HeadingGuard:
 
     def _rate_before(self, age: float) -> tuple[float, float, float]:
         """Rate `age` seconds ago, rad/s, body."""
-        until_s, until = self._turned_before(max(age - RATE_SPAN, 0.0))
-        since_s, since = self._turned_before(age + RATE_SPAN)
-        if not until_s > since_s:
-            return 0.0, 0.0, 0.0
-        x, y, z = ((until - since) / (until_s - since_s)).tolist()
-        return x, y, z
+        until = self._turned_before(max(age - RATE_SPAN, 0.0))
+        since = self._turned_before(age + RATE_SPAN)
+        x, y, z, seconds = (until - since).tolist()
+        return (x / seconds, y / seconds, z / seconds) if seconds > 0.0 else (0.0, 0.0, 0.0)
 
-    def _turned_before(self, age: float) -> tuple[float, Floats]:
-        for entry in reversed(self._turned):
-            if entry[0] <= self._elapsed - age + 1e-9:
-                return entry
-        return self._turned[0]
+    def _turned_before(self, age: float) -> Floats:
+        """The rate's integral `age` seconds ago, and that time; the oldest known, at most."""
+        i = np.searchsorted(self._turned[:, 3], self._elapsed - age + 1e-9, side="right")
+        entry: Floats = self._turned[max(int(i) - 1, 0)]
+        return entry
 
 
 def _is_course(motion: Motion) -> bool:

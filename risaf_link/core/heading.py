@@ -323,37 +323,39 @@ class HeadingMonitor:
         self._motion = Motion(math.nan, None)
         self._heading: Heading | None = None
         self._innovation: Innovation | None = None
-        self._since_fix = math.inf
-        self._since_fused = math.nan
+        self._elapsed = 0.0  # s
+        self._fix_s = -math.inf  # when the last one came
+        self._fused_s = math.nan
         self._fused_count = 0
         self._rejected_count = 0
 
-    def advance(self, dt: Floats, aligned: NDArray[np.bool_]) -> HeadingTrack:
-        """Let k epochs pass, each (k,) s since the one before, with yaw known or not.
+    def advance(self, elapsed: Floats, aligned: NDArray[np.bool_]) -> HeadingTrack:
+        """Let k epochs pass, with yaw known or not; nothing is noted in between.
 
-        Nothing is noted in between: the account of the run differs by the times alone.
+        Parameters
+        ----------
+        elapsed : ndarray, shape (k,)
+            Time of each, s.
+        aligned : ndarray, shape (k,)
         """
-        since_fix, since_fused = np.cumsum(
-            np.vstack(((self._since_fix, self._since_fused), np.repeat(dt[:, np.newaxis], 2, 1))),
-            axis=0,
-        )[1:].T
-        if len(dt):
-            self._since_fix, self._since_fused = float(since_fix[-1]), float(since_fused[-1])
-        lost = np.where(aligned, HeadingState.DEAD_RECKONING, HeadingState.NO_FIX)
-        state = np.where(since_fix > self._parameters.timeout, lost, self._having_fix(aligned))
+        self._elapsed = float(elapsed[-1])
+        state = self._having_fix(aligned)
+        if self._elapsed - self._fix_s > self._parameters.timeout:
+            lost = np.where(aligned, HeadingState.DEAD_RECKONING, HeadingState.NO_FIX)
+            state = np.where(elapsed - self._fix_s > self._parameters.timeout, lost, state)
         return HeadingTrack(
             self._heading,
             self._innovation,
             self._motion.speed,
             self._fused_count,
             self._rejected_count,
-            since_fused,
+            elapsed - self._fused_s,
             state,
         )
 
     def note_motion(self, motion: Motion) -> None:
         """Take note of a usable fix."""
-        self._since_fix = 0.0
+        self._fix_s = self._elapsed
         self._motion = motion
 
     def note_innovation(self, heading: Heading, innovation: Innovation) -> None:
@@ -361,7 +363,7 @@ class HeadingMonitor:
         self._heading, self._innovation = heading, innovation
         if innovation.fused:
             self._fused_count += 1
-            self._since_fused = 0.0
+            self._fused_s = self._elapsed
         else:
             self._rejected_count += 1
 

@@ -6,14 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from risaf_link.core.attitude import AttitudeState
+from risaf_link.core.earth import GRAVITY
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.rotation import Floats
 
 Q_NB, RATE, BIAS, STD = slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13)
 ALIGNED, RESETS = 13, 14
 FUSED, VARIANCE, NOISE, WALK = slice(15, 18), slice(18, 21), slice(21, 24), slice(24, 27)
-ACTIVE, VALID, FORCE = slice(27, 30), 30, slice(31, 34)
-COLUMNS = 34
+ACTIVE, VALID, FORCE, AHEAD = slice(27, 30), 30, slice(31, 34), 34
+COLUMNS = 35
 YAW_STD = 12
 
 
@@ -22,7 +23,7 @@ class Track:
 
     Parameters
     ----------
-    values : ndarray, shape (k, 34)
+    values : ndarray, shape (k, 35)
         The columns that this module names; units are those of `FusedRate` and `AttitudeState`.
     """
 
@@ -38,7 +39,7 @@ class Track:
                     *(state.q_nb, state.rate_b, state.bias_b),
                     (state.roll_std, state.pitch_std, state.yaw_std, state.aligned, state.resets),
                     *(fused.rate_b, fused.variance, fused.noise, fused.bias_walk, fused.active),
-                    *((fused.valid,), force_b),
+                    *((fused.valid,), force_b, (_ahead(state.q_nb, force_b),)),
                 )
             )
             for fused, state, force_b in epochs
@@ -89,6 +90,11 @@ class Track:
         return self.values[:, FORCE]
 
     @property
+    def ahead(self) -> Floats:
+        """Of the specific force what accelerates ahead, gravity taken off, (k,), m/s^2."""
+        return self.values[:, AHEAD]
+
+    @property
     def yaw_std(self) -> Floats:
         """Standard deviation of yaw, (k,), rad."""
         return self.values[:, YAW_STD]
@@ -113,3 +119,9 @@ class Track:
         return AttitudeState(
             time_us, row[Q_NB], row[RATE], row[BIAS], roll, pitch, yaw, aligned > 0.0, int(resets)
         )
+
+
+def _ahead(q_nb: Floats, force_b: Floats) -> float:
+    w, x, y, z = q_nb.tolist()
+    ahead: float = force_b[0].item() + GRAVITY * 2.0 * (x * z - w * y)
+    return ahead

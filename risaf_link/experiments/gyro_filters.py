@@ -32,7 +32,7 @@ class Service:
     def step(self, epoch: Epoch) -> None:
         """Carry the estimate on to an epoch."""
         readings = epoch.rates_b[np.newaxis], epoch.forces_b[np.newaxis]
-        track = self._estimator.advance(np.array([epoch.dt]), *readings)
+        track, _ = self._estimator.advance(np.array([epoch.dt]), *readings)
         self._estimate = estimate_of(track)
 
     def correct(self, gps: Gps) -> None:

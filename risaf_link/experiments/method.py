@@ -135,13 +135,15 @@ class Aided:
     def __init__(self) -> None:
         self.attitude = PaperFilter(AttitudeParameters())
         self._guard = HeadingGuard(HeadingParameters(), filter_knows=False)
+        self._elapsed = 0.0  # s
         self._estimate = Estimate(math.nan, math.pi, 0.0)
 
     def advance(self, fused: FusedRate, dt: float) -> None:
         """Carry the filter on by a fused rate, over `dt` seconds."""
         self.attitude.predict(fused, dt)
         track = Track.of([(fused, self.attitude.state(fused.time_us), NO_FORCE)])
-        self._guard.advance(track, np.array([dt]))
+        self._elapsed += dt
+        self._guard.advance(track, np.array([self._elapsed]), np.array([dt]))
         self._estimate = estimate_of(track)
 
     def correct(self, gps: Gps) -> None:

@@ -6,6 +6,9 @@ clock seems to jump, the third may have been set or the link may have stalled: t
 found before holds until the vehicle tells its time again.
 """
 
+import numpy as np
+from numpy.typing import NDArray
+
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame
 
@@ -15,6 +18,8 @@ GROUND_STATION, NO_AUTOPILOT = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
 
 _HEARTBEAT = reader("HEARTBEAT", "type", "autopilot")
 _SYSTEM_TIME = reader("SYSTEM_TIME", "time_unix_usec", "time_boot_ms")
+
+Times = NDArray[np.int64]
 
 
 class _Lead:
@@ -39,6 +44,21 @@ class _Lead:
             self.lead_us = max(self._current_us, lead_us)
             self._current_us, self._since_us = lead_us, received_us
         return has_jumped
+
+    def note_steady(self, time_us: Times, received_us: Times) -> Times | None:
+        """Take k times and arrivals, (k,) each; the lead at each. None: one by one, `note` it."""
+        if self.lead_us is None:
+            return None
+        leads_us = time_us - received_us
+        most_us = int(leads_us.max())
+        lead_us = max(self.lead_us, most_us)
+        since_us = received_us - self._since_us
+        steady = lead_us - min(self.lead_us, int(leads_us.min())) <= SAME_CLOCK_US
+        if not steady or since_us.min() < 0 or since_us.max() >= WINDOW_US:
+            return None
+        self._current_us = max(self._current_us, most_us)
+        before_us, self.lead_us = self.lead_us, lead_us
+        return np.maximum.accumulate(np.maximum(leads_us, before_us))
 
 
 class VehicleClock:
@@ -73,3 +93,16 @@ class VehicleClock:
         if abs(self._offset_us) < SAME_CLOCK_US:
             return time_us
         return max(time_us + self._offset_us, 0)
+
+    def boot_times(self, time_us: Times, received_us: Times) -> Times:
+        """Do what `boot_us` does, for k epochs that were received one after another."""
+        leads_us = self._array.note_steady(time_us, received_us)
+        if leads_us is None:
+            pairs = zip(time_us.tolist(), received_us.tolist(), strict=True)
+            return np.array([self.boot_us(*pair) for pair in pairs])
+        offsets_us = np.full(len(time_us), self._offset_us)
+        if self._vehicle.lead_us is not None:
+            offsets_us = self._vehicle.lead_us - leads_us
+            self._offset_us = int(offsets_us[-1])
+        same = np.abs(offsets_us) < SAME_CLOCK_US
+        return np.where(same, time_us, np.maximum(time_us + offsets_us, 0))

@@ -10,11 +10,11 @@
 
 namespace risaf {
 
-// What is known after one epoch, as a row of doubles; COLUMNS of kernel.py names them.
+// What is known after one epoch, as a row of doubles; track.py names them.
 struct Known {
   double q_nb[4], rate_b[3], bias_b[3], angle_std[3], aligned, resets;
   double fused[3], variance[3], noise[3], bias_walk[3], active[3], valid;
-  double force_b[3];
+  double force_b[3], ahead;
 };
 
 // Carry the attitude on over `epochs`, with readings of `n` gyros and `m` accelerometers each.
@@ -49,6 +49,8 @@ void advance(Fusion& gyros, Robust& accelerometers, Eskf& filter, Aiding& aiding
       known->active[k] = static_cast<double>(fused[k].active);
       known->force_b[k] = force_b[k];
     }
+    const double up = 2.0 * (q_nb.x * q_nb.z - q_nb.w * q_nb.y);
+    known->ahead = force_b[0] + filter.numbers().GRAVITY * up;
     known->aligned = filter.aligned();
     known->resets = filter.resets();
     known->valid = static_cast<double>(valid);
