@@ -124,7 +124,7 @@ class Replay:
             for truth in truths_in(table, times_us):
                 self.scorer.take_truth(*truth)
             for item in _singly(table, times_us) if singly else reader.read(table, times_us):
-                yield from self._noted(self._take(item))
+                yield from self._take(item)
                 if singly:
                     yield from self._noted(self._pipeline.release())
         yield from self._noted(self._pipeline.flush(received_us))
@@ -177,16 +177,19 @@ class Replay:
             if until < len(table):
                 return
 
-    def _take(self, item: EpochBlock | tuple[Frame, int]) -> list[EstimateBlock]:
+    def _take(self, item: EpochBlock | tuple[Frame, int]) -> Iterator[EstimateBlock]:
         if isinstance(item, EpochBlock):
-            return self._pipeline.advance(item)
+            yield from self._noted(self._pipeline.advance(item))
+            return
         frame, received_us = item
-        if frame.message_id in self._gps_ids and self.scorer.is_withheld():
-            fix = self._gps.decode(frame, received_us)
-            if isinstance(fix, GpsFix):
-                self.scorer.take_withheld(fix)
-            return []
-        return self._pipeline.gather(frame, received_us)
+        if frame.message_id in self._gps_ids:
+            yield from self._noted(self._pipeline.release())
+            if self.scorer.is_withheld():
+                fix = self._gps.decode(frame, received_us)
+                if isinstance(fix, GpsFix):
+                    self.scorer.take_withheld(fix)
+                return
+        yield from self._noted(self._pipeline.gather(frame, received_us))
 
     def _noted(self, blocks: list[EstimateBlock]) -> list[EstimateBlock]:
         for block in blocks:
