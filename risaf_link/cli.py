@@ -134,11 +134,13 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
     import logging
 
     from risaf_link.config import load
+    from risaf_link.kept import kept_parameters
     from risaf_link.service import Service, until_told
 
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(levelname)s %(message)s")
-    service = Service(load(config_path, settings))
+    config = load(config_path, settings)
+    service = Service(config, kept_parameters(config, config_path, settings))
     asyncio.run(until_told(service.run()))
 
 

@@ -18,6 +18,7 @@ from risaf_link.config import Config, load
 from risaf_link.links import UdpInLink
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import Frame, FrameParser
+from risaf_link.mavlink.peers import EMITTED
 from risaf_link.mavlink.tlog import TlogReader
 from risaf_link.replay import OutputLog, Replay, Selection
 from risaf_link.service import Service
@@ -123,7 +124,7 @@ async def feed(ground: Ground, service: Service, sent: list[list[bytes]]) -> lis
 
 
 def outputs(heard: list[Frame]) -> list[tuple[int, bytes]]:
-    return [(f.message_id, f.payload) for f in heard if f.message_id != IDS["HEARTBEAT"]]
+    return [(f.message_id, f.payload) for f in heard if f.message_id in EMITTED]
 
 
 def replayed(config: Config, log: Path) -> list[tuple[int, bytes]]:
