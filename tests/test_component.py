@@ -223,9 +223,14 @@ class TestRequests:
 
 
 FIELDS = {
-    "time_boot_ms": "uint32_t", "capabilities": "uint64_t", "time_manufacture_s": "uint32_t",
-    "vendor_name": "char[32]", "model_name": "char[32]", "software_version": "char[24]",
-    "hardware_version": "char[24]", "serial_number": "char[32]",
+    "time_boot_ms": "uint32_t",
+    "capabilities": "uint64_t",
+    "time_manufacture_s": "uint32_t",
+    "vendor_name": "char[32]",
+    "model_name": "char[32]",
+    "software_version": "char[24]",
+    "hardware_version": "char[24]",
+    "serial_number": "char[32]",
 }
 BASIC = f"""<mavlink><version>3</version><messages>
 <message id="396" name="COMPONENT_INFORMATION_BASIC"><description>As in common.xml.</description>

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from network import FAR, NEAR, Network, changed, of
 from pymavlink.dialects.v20 import all as public
+from wire import frame
 
 from risaf_link.config import Config
 from risaf_link.mavlink.parameters import Parameters, parameters_of
