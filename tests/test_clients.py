@@ -5,7 +5,9 @@ import json
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from random import Random
 
@@ -17,8 +19,9 @@ from risaf_link.mavlink.parameters import parameters_of
 
 CLIENTS = Path(__file__).parent / "clients"
 DEADLINE_S = 90
+SYSTEM = 3
 RISAF = [sys.executable, "-c", "from risaf_link.cli import main; main()"]
-ACCEPTED, DENIED, UNSUPPORTED, IN_PROGRESS = 0, 2, 3, 5
+ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 
 
 def free_port() -> int:
@@ -37,7 +40,7 @@ class Running:
             {"name": "array", "url": f"udpin://127.0.0.1:{array}", "emit": {}},
             {"name": "ground", "url": f"udpin://127.0.0.1:{self.port}"},
         ]
-        self.config.write_text(yaml.safe_dump({"links": links, "mavlink": {"system_id": 3}}))
+        self.config.write_text(yaml.safe_dump({"links": links, "mavlink": {"system_id": SYSTEM}}))
         self.written = self.config.read_text()
         self.log = (directory / "log").open("w+")
         url = f"udpout://127.0.0.1:{array}"
@@ -138,13 +141,36 @@ async def test_two_ground_stations_at_once_each_with_its_own_rates(service):
     assert service.config.read_text() == service.written
 
 
-async def test_a_ground_station_on_a_bad_link(service):
-    loop = asyncio.get_running_loop()
-    to = ("127.0.0.1", service.port)
-    transport, link = await loop.create_datagram_endpoint(
-        lambda: BadLink(to, seed=5), local_addr=("127.0.0.1", 0)
+@asynccontextmanager
+async def bad_link(service: Running) -> AsyncIterator[BadLink]:
+    transport, link = await asyncio.get_running_loop().create_datagram_endpoint(
+        lambda: BadLink(("127.0.0.1", service.port), seed=5), local_addr=("127.0.0.1", 0)
     )
-    found = await client("ground_station.py", f"udpout:127.0.0.1:{link.port}", 10)
+    yield link
     transport.close()
-    assert_served(found, 10)
     assert link.lost > 5
+
+
+async def test_a_ground_station_on_a_bad_link(service):
+    async with bad_link(service) as link:
+        found = await client("ground_station.py", f"udpout:127.0.0.1:{link.port}", 10)
+    assert_served(found, 10)
+
+
+@pytest.mark.skipif(not find_spec("mavsdk"), reason="mavsdk is not installed")
+@pytest.mark.parametrize("is_bad", [False, True], ids=["good link", "bad link"])
+async def test_mavsdk_takes_us_for_a_component_and_tunes_it(service, is_bad):
+    if is_bad:
+        async with bad_link(service) as link:
+            found = await client("mavsdk_client.py", link.port, SYSTEM)
+    else:
+        found = await client("mavsdk_client.py", service.port, SYSTEM)
+    assert found["components"] == [191]
+    assert not found["has_autopilot"]
+    assert (found["read"], found["set"], found["read_again"]) == (4.0, 1, 5.5)  # 1: SUCCESS
+    assert (found["unknown"], found["refused"]) == ("DOES_NOT_EXIST", "VALUE_OUT_OF_RANGE")
+    assert found["all"] == sorted(parameter.name for parameter in parameters_of(Config))
+    results = [found[name] for name in ("accepted", "denied", "unsupported")]
+    assert results == [ACCEPTED, DENIED, UNSUPPORTED]
+    attitude = found["attitude"]
+    assert sum(attitude[f"q{i}"] ** 2 for i in range(1, 5)) == pytest.approx(1.0, abs=1e-6)
