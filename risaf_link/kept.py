@@ -12,8 +12,8 @@ from typing import Any
 
 import yaml
 
-from risaf_link.config import Config
-from risaf_link.mavlink.parameters import parameters_of
+from risaf_link.config import Config, load
+from risaf_link.mavlink.parameters import Parameters, parameters_of
 
 HEAD = "# Parameters that were set over MAVLink; they go over the configuration.\n"
 
@@ -26,6 +26,8 @@ class KeptParameters:
 
     path: Path | None = None
     values: dict[str, float] = field(default_factory=dict)
+    overruled: dict[str, float] = field(default_factory=dict)
+    """Those that the command line sets: they are kept, but not in force."""
 
     def write(self, values: dict[str, float]) -> str:
         """Replace what is kept, all or nothing, also if power fails; why it failed, or nothing."""
@@ -66,20 +68,38 @@ def kept_parameters(
     """
     path = _place(config, config_path)
     found = _read(path) if path else {}
-    set_keys = [setting.partition("=")[0] for setting in settings]
+    chosen = chosen_by(settings)
     known = {parameter.name: parameter for parameter in parameters_of(Config)}
-    values = {}
+    values: dict[str, float] = {}
+    overruled: dict[str, float] = {}
     for name, value in found.items():
         parameter = known.get(name)
         usable = isinstance(value, int | float) and not isinstance(value, bool)
         if parameter is None or not usable or not parameter.admits(float(value)):
             expected = parameter.expected if parameter else "a known parameter"
             _log.warning("%s: %s: found %r, expected %s; left out", path, name, value, expected)
-        elif not any(
-            parameter.key == key or parameter.key.startswith(f"{key}.") for key in set_keys
-        ):
-            values[parameter.name] = float(value)
-    return KeptParameters(path, values)
+        else:
+            (overruled if name in chosen else values)[parameter.name] = float(value)
+    return KeptParameters(path, values, overruled)
+
+
+def load_in_force(config_path: Path | None, settings: Iterable[str] = ()) -> Config:
+    """Read a configuration, with the parameters that were kept for it.
+
+    Parameters and errors are those of `load`.
+    """
+    config = load(config_path, settings)
+    return Parameters(config, kept_parameters(config, config_path, settings).values).tuned
+
+
+def chosen_by(settings: Iterable[str]) -> tuple[str, ...]:
+    """Names of the parameters that `KEY=VALUE` of the command line sets."""
+    keys = [setting.partition("=")[0] for setting in settings]
+    return tuple(
+        parameter.name
+        for parameter in parameters_of(Config)
+        if any(f"{parameter.key}.".startswith(f"{key}.") for key in keys)
+    )
 
 
 def _place(config: Config, config_path: Path | None) -> Path | None:

@@ -69,7 +69,7 @@ class Service:
         kept: KeptParameters = NOTHING_KEPT,
         clock_us: Callable[[], int] = unix_us,
     ) -> None:
-        parameters = Parameters(config, kept.values)
+        parameters = Parameters(config, kept.values, kept.overruled)
         self.pipeline = Pipeline(parameters.tuned, config.own, load_calibration(config))
         self.links = [open_link(link.url, link.name, clock_us) for link in config.links]
         self._clock_us = clock_us

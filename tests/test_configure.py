@@ -221,6 +221,7 @@ class TestKeptFile:
         text = "{FUS_GATE: 5.0, HDG_ANT_X: 1, HDG_GATE: 2}"
         kept = self.kept(tmp_path, text, "fusion.gate=3", "heading.antenna=[2, 0, 0]")
         assert kept.values == {"HDG_GATE": 2.0}
+        assert kept.overruled == {"FUS_GATE": 5.0, "HDG_ANT_X": 1.0}
 
     @pytest.mark.parametrize(
         ("text", "said"),

@@ -170,6 +170,14 @@ def test_what_was_kept_goes_over_the_configuration():
     assert network.parameters.kept == {"FUS_GATE": 8.0}
 
 
+def test_what_the_command_line_overrules_stays_kept_until_all_is_forgotten():
+    parameters = Parameters(Config(), {"HDG_GATE": 5.0}, {"FUS_GATE": 8.0})
+    assert parameters.tuned.fusion.gate == 4.0
+    assert parameters.kept == {"FUS_GATE": 8.0, "HDG_GATE": 5.0}
+    parameters.reset()
+    assert (parameters.kept, parameters.tuned) == ({}, Config())
+
+
 @given(
     index=st.integers(0, len(ALL) - 1),
     value=st.floats(width=32) | st.integers(-10, 10).map(float),

@@ -8,7 +8,7 @@ Inside, the readings stand by channel, shape (3, n), since NumPy is quickest alo
 reading that is not finite is not valid.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
@@ -96,6 +96,15 @@ class EpochBlock:
 
     def __len__(self) -> int:
         return len(self.time_us)
+
+    def each(self) -> "Iterator[EpochBlock]":
+        """The epochs, one by one."""
+        for i in range(len(self)):
+            one = slice(i, i + 1)
+            rates_b, forces_b = self.rates_b[one], self.forces_b[one]
+            yield EpochBlock(
+                self.time_us[one], self.dt[one], rates_b, forces_b, self.received_us[one]
+            )
 
 
 @dataclass(frozen=True, slots=True)

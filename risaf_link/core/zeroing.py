@@ -13,6 +13,7 @@ QUIET = 0.05  # rad/s, standard deviation within a block of what stands: an idli
 STEADY = 0.01  # rad/s, between the means of blocks
 LARGEST_BIAS = 0.15  # rad/s; no gyro at rest shows more: PX4's EKF2_GYR_B_LIM
 FLOOR = 1e-4  # rad/s, standard deviation of a mean: wind, people
+LONGEST_GAP = 1.0  # s, between rates
 PATIENCE = 10.0  # s, without as many usable rates in it as it needs
 
 
@@ -69,7 +70,7 @@ class Zeroing:
         if self._since_s is None:
             self._since_s = self._last_s = time_s
         step, self._last_s = time_s - self._last_s, time_s
-        if time_s - self._since_s > PATIENCE:
+        if step > LONGEST_GAP or time_s - self._since_s > PATIENCE:
             self.state = Zeroed.STARVED
         elif speed > STANDING_SPEED:
             self.state = Zeroed.MOVED

@@ -203,6 +203,11 @@ class Component:
         if order:
             self._acknowledge(order, Result.FAILED if failure else Result.ACCEPTED)
 
+    @property
+    def is_calibrating(self) -> bool:
+        """Whether every estimate must be observed, even if nobody listens."""
+        return self._zeroing is not None
+
     # Out
 
     def collect(self, peers: Iterable[Peer]) -> list[tuple[Peer, bytes]]:

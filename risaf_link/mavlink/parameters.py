@@ -6,7 +6,7 @@ cast in ArduPilot), not from the component that sends it; for REAL32 all ways ar
 """
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -66,6 +66,10 @@ class Parameters(Generic[Tuned]):
     kept : mapping of str to float
         Values kept from before, by name, that go over them. What is not known or not allowed is
         left out.
+    overruled : mapping of str to float
+        Values that are kept as well, but not in force.
+    fixed : collection of str
+        Names of those that cannot be set.
 
     Attributes
     ----------
@@ -77,10 +81,17 @@ class Parameters(Generic[Tuned]):
         What was set, by name: what is worth keeping.
     """
 
-    def __init__(self, configured: Tuned, kept: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        configured: Tuned,
+        kept: Mapping[str, float] | None = None,
+        overruled: Mapping[str, float] | None = None,
+        fixed: Collection[str] = (),
+    ) -> None:
         self.all = parameters_of(type(configured))
-        self.kept: dict[str, float] = {}
+        self.kept: dict[str, float] = dict(overruled or {})
         self.tuned = self._configured = configured
+        self._fixed = frozenset(fixed)
         self._index = {parameter.name: i for i, parameter in enumerate(self.all)}
         for name, value in (kept or {}).items():
             self.set(name, value)
@@ -101,7 +112,7 @@ class Parameters(Generic[Tuned]):
         A value that is that in force, rounded to a float32, changes nothing.
         """
         index = self.index(name)
-        if index is None or not self.all[index].admits(value):
+        if index is None or name in self._fixed or not self.all[index].admits(value):
             return False
         if value != rounded(self.value(index)):
             self.tuned = self._with(self.all[index], value)
