@@ -5,7 +5,7 @@ import logging
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -124,13 +124,13 @@ class Service:
         self._tell_mismatch()
 
     def _send(self, estimates: list[Estimate]) -> None:
-        peers = self._peers() if estimates else []
+        peers = list(self._peers()) if estimates else []
         for estimate in estimates:
             self._component.observe(estimate)
             self._hand_out(self._component.emit(estimate, peers))
 
-    def _peers(self) -> list[Peer]:
-        return [(link.name, peer) for link in self.links for peer in link.peers]
+    def _peers(self) -> Iterator[Peer]:
+        return ((link.name, peer) for link in self.links for peer in link.peers)
 
     def _hand_out(self, frames: list[tuple[Peer, bytes]]) -> None:
         for (link, peer), raw in frames:

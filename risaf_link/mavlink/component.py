@@ -12,24 +12,20 @@ from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
 from typing import Any, Protocol
 
-import numpy as np
-
 from risaf_link import __version__
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.rotation import Floats
-from risaf_link.core.zeroing import Zeroed, Zeroing
 from risaf_link.mavlink.commands import Command, Order, Peer, Result, order_in, whole
 from risaf_link.mavlink.dialect import IDS, name_of
 from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.gyro_calibration import GyroCalibration, Report
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.notices import Notice, Notices, Severity, statustexts
 from risaf_link.mavlink.parameters import Parameters
-from risaf_link.mavlink.peers import EMITTED, HEARTBEAT_US, Peers
-from risaf_link.mavlink.telemetry import ComponentState, Rates, heartbeat
+from risaf_link.mavlink.peers import EMITTED, Peers
+from risaf_link.mavlink.pulse import Pulse
+from risaf_link.mavlink.telemetry import Rates, heartbeat
 from risaf_link.mavlink.tuning import Answer, Tuning
-
-STALLED_US, SILENT_US = 2_000_000, 10_000_000  # without an epoch: CRITICAL, then no HEARTBEAT
-PROGRESS_STEP = 0.1  # of a calibration, from one IN_PROGRESS to the next
 
 CAPABILITIES = 8 | 16 | 8192
 """MAV_PROTOCOL_CAPABILITY: COMMAND_INT, PARAM_ENCODE_BYTEWISE (REAL32 is the same in both ways, and
@@ -116,11 +112,10 @@ class Component:
         self._outbox: list[tuple[Peer | None, str, dict[str, Any]]] = []  # None: to all
         self._estimate: Estimate | None = None
         self._received_us = 0
-        self._zeroing: tuple[Zeroing, Order] | None = None
-        self._reported = 0.0  # progress
+        self._calibration = GyroCalibration(estimator.set_bias)
+        self._pulse = Pulse()
         self._storing: Order | None = None
-        self._epochs = self._epochs_before = 0
-        self._progress_us = self._advanced_us = self._beaten_us = -1
+        self._advanced_us: int | None = None
         self._commands: dict[int, Callable[[Order], Result]] = {
             Command.PREFLIGHT_CALIBRATION: self._calibrate,
             Command.PREFLIGHT_STORAGE: self._store,
@@ -159,11 +154,10 @@ class Component:
 
     def observe(self, estimate: Estimate) -> None:
         """Take the next estimate."""
-        self._epochs += 1
         self._estimate = estimate
+        self._pulse.note_epoch()
         self._notices.observe(estimate)
-        if self._zeroing:
-            self._zero(*self._zeroing, estimate)
+        self._report(self._calibration.observe(estimate))
 
     def advance(self, now_us: int) -> None:
         """Do what is due by time: HEARTBEAT, notices, lists of parameters.
@@ -173,22 +167,13 @@ class Component:
         now_us : int
             Microseconds of a clock that does not jump.
         """
-        if self._advanced_us < 0:
-            self._advanced_us = self._progress_us = now_us
-        seconds, self._advanced_us = (now_us - self._advanced_us) / 1e6, now_us
-        if self._epochs != self._epochs_before:
-            self._epochs_before, self._progress_us = self._epochs, now_us
-        still_us = now_us - self._progress_us
-        has_stalled = bool(self._epochs) and still_us >= STALLED_US
-        if self._zeroing and has_stalled:
-            self._end_zeroing(Result.FAILED, "gyro calibration failed: no samples")
-        if self._beaten_us < 0 or now_us - self._beaten_us >= HEARTBEAT_US:
-            late = now_us - self._beaten_us >= 2 * HEARTBEAT_US
-            self._beaten_us = (
-                now_us if self._beaten_us < 0 or late else self._beaten_us + HEARTBEAT_US
-            )
-            self._beat(has_stalled, bool(self._epochs) and still_us >= SILENT_US)
-        for notice in self._notices.due(now_us, has_stalled, self.trouble):
+        seconds = (now_us - self._advanced_us) / 1e6 if self._advanced_us is not None else 0.0
+        self._advanced_us = now_us
+        if self._pulse.advance(now_us):
+            self._outbox.append((None, "HEARTBEAT", heartbeat(self._pulse.state)))
+        if self._pulse.has_stalled:
+            self._report(self._calibration.end("failed: no samples"))
+        for notice in self._notices.due(now_us, self._pulse.has_stalled, self.trouble):
             self._tell(notice)
         for peer, answer in self._tuning.due(seconds, self._pace):
             self._outbox.append((peer, answer.name, answer.fields))
@@ -206,7 +191,7 @@ class Component:
     @property
     def is_calibrating(self) -> bool:
         """Whether every estimate must be observed, even if nobody listens."""
-        return self._zeroing is not None
+        return self._calibration.is_running
 
     # Out
 
@@ -245,13 +230,6 @@ class Component:
         for fields in statustexts(notice, self._told):
             self._outbox.append((None, "STATUSTEXT", fields))
 
-    def _beat(self, has_stalled: bool, is_silent: bool) -> None:
-        if is_silent:
-            return
-        state = ComponentState.CRITICAL if has_stalled else ComponentState.ACTIVE
-        fields = heartbeat(state if self._epochs else ComponentState.BOOT)
-        self._outbox.append((None, "HEARTBEAT", fields))
-
     def _adopt(self) -> None:
         """Speak under the vehicle's system id from now on."""
         self._estimator.adopt(self._identity.own)
@@ -274,12 +252,10 @@ class Component:
         result = command(order) if command else Result.UNSUPPORTED
         done = result in {Result.ACCEPTED, Result.IN_PROGRESS}
         if done or order.to == (system, component):
-            self._acknowledge(order, result)
+            in_progress = result is Result.IN_PROGRESS and command == self._calibrate
+            self._acknowledge(order, result, self._calibration.percent if in_progress else 255)
 
-    def _acknowledge(self, order: Order, result: Result) -> None:
-        progress = 255
-        if result is Result.IN_PROGRESS and self._zeroing:
-            progress = round(100 * self._zeroing[0].progress)
+    def _acknowledge(self, order: Order, result: Result, progress: int = 255) -> None:
         self._outbox.append((order.peer, "COMMAND_ACK", order.ack(result, progress)))
 
     def _set_interval(self, order: Order) -> Result:
@@ -309,7 +285,7 @@ class Component:
         elif wanted == IDS["COMPONENT_INFORMATION_BASIC"]:
             fields = self._information()
         elif wanted == IDS["HEARTBEAT"]:
-            fields = heartbeat(ComponentState.ACTIVE if self._epochs else ComponentState.BOOT)
+            fields = heartbeat(self._pulse.state)
         elif wanted == IDS["MESSAGE_INTERVAL"]:
             return self._post_interval(whole(order.parameters[1]), order)
         else:
@@ -339,8 +315,7 @@ class Component:
             return Result.DENIED
         if self._identity.is_armed(self._received_us):
             return Result.TEMPORARILY_REJECTED
-        if self._zeroing:
-            self._end_zeroing(Result.FAILED, "gyro calibration ended: the filter restarts")
+        self._report(self._calibration.end("ended: the filter restarts"))
         self._estimator.restart()
         self._tell(Notice(Severity.NOTICE, "the filter restarts"))
         return Result.ACCEPTED
@@ -376,43 +351,19 @@ class Component:
         self._keep(dict(self._parameters.kept))
         return Result.IN_PROGRESS
 
-    # Calibration of the gyros' bias
-
     def _calibrate(self, order: Order) -> Result:
         wanted = order.told
-        if self._zeroing:
-            if not any(wanted):
-                self._end_zeroing(Result.FAILED, "gyro calibration cancelled")
-                return Result.ACCEPTED
-            same = (self._zeroing[1].asker, self._zeroing[1].peer) == (order.asker, order.peer)
-            return Result.IN_PROGRESS if same else Result.TEMPORARILY_REJECTED
-        if not any(wanted):  # nothing to cancel
+        if not any(wanted):
+            self._report(self._calibration.end("cancelled"))
             return Result.ACCEPTED
         if wanted[0] != 1 or any(wanted[1:]):
             return Result.DENIED
         if self._identity.is_armed(self._received_us) or self._estimate is None:
             return Result.TEMPORARILY_REJECTED
-        self._zeroing, self._reported = (Zeroing(), order), 0.0
-        return Result.IN_PROGRESS
+        return self._calibration.begin(order)
 
-    def _zero(self, zeroing: Zeroing, order: Order, estimate: Estimate) -> None:
-        zeroing.take(estimate.fused.rate_b, estimate.heading.speed, estimate.elapsed)
-        if zeroing.state is Zeroed.DONE:
-            self._estimator.set_bias(zeroing.mean, zeroing.variance)
-            bias = np.degrees(zeroing.mean)
-            said = ", ".join(f"{x:+.2f}" for x in bias.tolist())
-            self._end_zeroing(Result.ACCEPTED, f"gyro bias {said} deg/s")
-        elif zeroing.state is Zeroed.MOVED:
-            self._end_zeroing(Result.FAILED, "gyro calibration failed: not at rest")
-        elif zeroing.state is Zeroed.STARVED:
-            self._end_zeroing(Result.FAILED, "gyro calibration failed: too few samples")
-        elif zeroing.progress - self._reported > PROGRESS_STEP - 1e-9:
-            self._reported = zeroing.progress
-            self._acknowledge(order, Result.IN_PROGRESS)
-
-    def _end_zeroing(self, result: Result, text: str) -> None:
-        ended, self._zeroing = self._zeroing, None
-        severity = Severity.INFO if result is Result.ACCEPTED else Severity.WARNING
-        self._tell(Notice(severity, text))
-        if ended:
-            self._acknowledge(ended[1], result)
+    def _report(self, reports: list[Report]) -> None:
+        for report in reports:
+            if report.notice:
+                self._tell(report.notice)
+            self._acknowledge(report.order, report.result, report.progress)

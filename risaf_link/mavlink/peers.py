@@ -5,10 +5,10 @@ from typing import get_args
 
 from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.pulse import HEARTBEAT_US
 from risaf_link.mavlink.telemetry import Emitter, Message, Rates
 
 MOST_PEERS = 256  # that are remembered
-HEARTBEAT_US = 1_000_000
 FASTEST_US = 100.0  # shortest interval of a message: the array's rate is less anyway
 LARGEST_INTERVAL_US = 2**31 - 1
 
