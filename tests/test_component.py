@@ -366,11 +366,12 @@ class Vehicles(Network):
             self.time_us += 10_000
             for estimate in self.pipeline.step(self.vehicle.epoch(self.time_us, rate), 0):
                 self.estimate(estimate)
+                self.last = estimate
             heard += self.heard().get(NEAR, [])
         return heard
 
     def bias(self):
-        return self.pipeline._filter.state(0).bias_b
+        return self.last.attitude.bias_b
 
 
 class TestCalibration:
