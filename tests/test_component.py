@@ -452,6 +452,18 @@ class TestNotices:
         assert self.told(network, **out) == ["GPS lost: heading by dead reckoning"]
         assert self.told(network, **on) == ["GPS is back"]
 
+    def test_after_a_restart_it_is_told_when_the_heading_is_aligned_again(self, network):
+        aligned = replace(ESTIMATE.attitude, aligned=True, resets=1)
+        self.told(network, attitude=aligned)
+        assert self.told(network) == []
+        assert self.told(network, attitude=aligned) == ["heading aligned: 0 deg"]
+
+    def test_where_estimates_are_refused_samples_are_not_said_to_be_missing(self, network):
+        self.told(network, 2)
+        network.component.trouble = "3 sensors, calibrated are 5"
+        said = texts(network.wait(8)[NEAR])
+        assert said == ["no estimates: 3 sensors, calibrated are 5"]
+
     def test_rejection_is_a_state_after_two_seconds(self, network):
         brief = {"heading": self.status(HeadingState.REJECTING, time_since_fused=1.0)}
         long = {"heading": self.status(HeadingState.REJECTING, time_since_fused=3.0)}

@@ -68,15 +68,16 @@ class Notices:
         trouble : str
             Why there are no estimates; empty: there are, or nothing has come.
         """
-        notices = [self._of_samples(now_us, has_stalled), self._of_trouble(now_us, trouble)]
+        silent = has_stalled and not trouble
+        notices = [self._of_samples(now_us, silent), self._of_trouble(now_us, trouble)]
         if self._estimate:
             notices += self._of_estimate(self._estimate, now_us)
         return [notice for notice in notices if notice]
 
-    def _of_samples(self, now_us: int, has_stalled: bool) -> Notice | None:
-        if not self._changed("samples", has_stalled, False, now_us):
+    def _of_samples(self, now_us: int, silent: bool) -> Notice | None:
+        if not self._changed("samples", silent, False, now_us):
             return None
-        if has_stalled:
+        if silent:
             return Notice(Severity.CRITICAL, "no samples from the array: no estimates")
         return Notice(Severity.INFO, "samples are back")
 
@@ -90,7 +91,7 @@ class Notices:
         notices: list[Notice | None] = []
         if self._changed("clock", self._clock_resets, 0, now_us):
             notices.append(Notice(Severity.NOTICE, "the array's clock was reset"))
-        if self._changed("yaw", attitude.resets, 0, now_us):
+        if self._changed("yaw", attitude.resets, 0, now_us) and attitude.aligned:
             word = "aligned" if attitude.resets == 1 else "set anew"
             degrees = math.degrees(attitude.euler[2]) % 360.0
             notices.append(Notice(Severity.INFO, f"heading {word}: {degrees:.0f} deg"))
