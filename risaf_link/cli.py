@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # what a command needs is imported when it runs: help must co
     from risaf_link.config import Config
     from risaf_link.core.estimate import EstimateBlock
     from risaf_link.publish.plot import HeadingPlot
+    from risaf_link.replay import Replay
 
 EXIT_STATUS: dict[type[RisafError], int] = {ConfigError: 2, LinkError: 2, LogError: 3}
 
@@ -134,11 +135,13 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
     import logging
 
     from risaf_link.config import load
+    from risaf_link.kept import kept_parameters
     from risaf_link.service import Service, until_told
 
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(levelname)s %(message)s")
-    service = Service(load(config_path, settings))
+    config = load(config_path, settings)
+    service = Service(config, kept_parameters(config, config_path, settings))
     asyncio.run(until_told(service.run()))
 
 
@@ -379,16 +382,17 @@ def check_config(file: Path) -> None:
 def _replay_one(
     log: Path, config_path: Path | None, settings: tuple[str, ...], options: dict[str, Any]
 ) -> None:
-    from risaf_link.config import load
+    from risaf_link.kept import chosen_by, load_in_force
     from risaf_link.replay import Replay, Selection
     from risaf_link.words import summary_text
 
-    config = load(config_path, settings)
-    selection = Selection(options["start"], options["end"], options["outages"])
+    config = load_in_force(config_path, settings)
+    span = options["start"], options["end"], options["outages"]
+    selection = Selection(*span, chosen_by(settings))
     replayed = Replay(config, log, selection, keep_trace=bool(options["plot"]))
     plot = _plot(options["plot"])
     with ExitStack() as files, _progress(log) as progress:
-        sinks = [*_sinks(config, options, files), *([plot.take] if plot else [])]
+        sinks = [*_sinks(config, replayed, options, files), *([plot.take] if plot else [])]
         singly = bool(options["out"] or options["speed"])
         for block in replayed.blocks(progress, singly):
             for sink in sinks:
@@ -405,16 +409,17 @@ def _replay_all(
     settings: tuple[str, ...],
     options: dict[str, Any],
 ) -> None:
-    from risaf_link.config import load
     from risaf_link.fleet import replay_all
+    from risaf_link.kept import chosen_by, load_in_force
     from risaf_link.replay import Selection
     from risaf_link.words import fleet_text
 
     for name in ("speed", "out", "plot"):
         if options[name] is not None:
             raise ConfigError(f"--{name}: only for one log, without --workers and --cluster")
-    config = load(config_path, settings)
-    selection = Selection(options["start"], options["end"], options["outages"])
+    config = load_in_force(config_path, settings)
+    span = options["start"], options["end"], options["outages"]
+    selection = Selection(*span, chosen_by(settings))
     spread = options["csv"], options["workers"], options["cluster"]
     rows = replay_all(logs, config, selection, *spread)
     click.echo(json.dumps(rows) if options["as_json"] else fleet_text(rows))
@@ -430,7 +435,9 @@ def _open(path: Path, mode: str) -> Any:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
 
 
-def _sinks(config: "Config", options: dict[str, Any], files: ExitStack) -> list[Sink]:
+def _sinks(
+    config: "Config", replayed: "Replay", options: dict[str, Any], files: ExitStack
+) -> list[Sink]:
     """What is to be done with the estimates."""
     from risaf_link.publish.rows import RowWriter
     from risaf_link.replay import OutputLog
@@ -439,7 +446,8 @@ def _sinks(config: "Config", options: dict[str, Any], files: ExitStack) -> list[
     if options["speed"]:
         sinks.append(_pace(options["speed"]))
     if options["out"]:
-        log = OutputLog(config, files.enter_context(_open(options["out"], "wb")))
+        file = files.enter_context(_open(options["out"], "wb"))
+        log = OutputLog(config, file, replayed.identity)
         sinks.append(log.write)
     if options["csv"]:
         rows = RowWriter(files.enter_context(_open(options["csv"], "w")))

@@ -15,20 +15,23 @@ import yaml
 from msgspec import Meta, Struct, field, inspect
 
 from risaf_link.core.array import ArrayCalibration, Calibration
+from risaf_link.core.tunable import Tunable
 from risaf_link.errors import ConfigError, LinkError
 from risaf_link.links import open_link
-from risaf_link.mavlink.telemetry import DEFAULT_RATES, Message
+from risaf_link.mavlink.telemetry import DEFAULT_RATES, Rates
 from risaf_link.pipeline import PipelineParameters
 
-Rates = dict[Message, Annotated[float, Meta(gt=0, le=10_000)]]
 Id = Annotated[int, Meta(ge=1, le=255)]
+RATE_NAMES = ("RATE_ATT_QUAT", "RATE_GPS_HDG", "RATE_ARRAY", "RATE_HEALTH", "RATE_REASON")
+"""Of the parameters that set the rates of `Message`s, in their order."""
 
 
 class MavlinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """Who this service is on the MAVLink network."""
 
-    system_id: Id = 1
+    system_id: Id | None = None  # None: that of the one autopilot that is heard; 1 before
     component_id: Id = 191
+    parameters: str = ""  # file that keeps what was set over MAVLink
 
 
 class LinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,7 +46,9 @@ class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
     """Everything that can be configured."""
 
     mavlink: MavlinkParameters = field(default_factory=MavlinkParameters)
-    emit: Rates = field(default_factory=DEFAULT_RATES.copy)
+    emit: Annotated[Rates, Tunable(RATE_NAMES, "Hz")] = field(default_factory=DEFAULT_RATES.copy)
+    """how often it goes to a peer that has not asked for another rate, on links without an `emit`
+    of their own."""
     links: tuple[LinkParameters, ...] = (
         LinkParameters("vehicle", "udpin://127.0.0.1:14560"),
         LinkParameters("ground", "udpout://127.0.0.1:14550"),
@@ -52,7 +57,7 @@ class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
     @property
     def own(self) -> tuple[int, int]:
         """System and component id of this service."""
-        return self.mavlink.system_id, self.mavlink.component_id
+        return self.mavlink.system_id or 1, self.mavlink.component_id
 
 
 def load(path: Path | None, settings: Iterable[str] = ()) -> Config:

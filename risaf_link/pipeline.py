@@ -18,6 +18,7 @@ from risaf_link.core.estimator import Estimator
 from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.health import ArrayHealth
+from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
@@ -70,12 +71,38 @@ class Pipeline:
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
         self._clock = VehicleClock()
+        self._parameters = p
         self._estimator = Estimator(p.fusion, p.attitude, p.heading)
         self._health = self._estimator.fusion.health()
         self._judged = 0.0  # s, when it was made
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
         self._waiting: list[tuple[Epoch, int]] = []
+
+    def configure(self, parameters: PipelineParameters) -> None:
+        """Take new parameters of fusion, heading and attitude, from the next epoch on.
+
+        What was learnt stays. Another method of fusion starts anew; another filter waits for
+        `restart`, and so does what is said of the filter's start.
+        """
+        p = self._parameters = parameters
+        self._estimator.configure(p.fusion, p.attitude, p.heading)
+        self._finder.configure(p.heading)
+        self._monitor.configure(p.heading)
+
+    def restart(self) -> None:
+        """Start the attitude filter, and what judges its headings, anew; the array stays known."""
+        self._estimator.restart()
+        self._finder = HeadingFinder(self._parameters.heading)
+        self._monitor = HeadingMonitor(self._parameters.heading)
+
+    def set_bias(self, rate_b: Floats, variance: Floats) -> None:
+        """Believe the mean fused rate of a vehicle at rest, (3,) rad/s, and its variance."""
+        self._estimator.set_bias(rate_b, variance)
+
+    def adopt(self, own: tuple[int, int]) -> None:
+        """Take note that this service has other ids now."""
+        self.ingest.own = own
 
     def step(self, frame: Frame, received_us: int) -> list[Estimate]:
         """Take one frame; the estimates that became possible by it, one an epoch.

@@ -17,13 +17,19 @@ from risaf_link.core.outage import Outage, Scorer, in_degrees
 from risaf_link.errors import ConfigError, LogError
 from risaf_link.links.file import read
 from risaf_link.mavlink.block import BlockReader
+from risaf_link.mavlink.commands import Peer
+from risaf_link.mavlink.component import ORDERS, Component
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import Frame, FrameTable
+from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.ingest import Ingest
+from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.telemetry import ComponentState, Emitter
 from risaf_link.mavlink.tlog import SENT, Stamps, TlogReader, record
 from risaf_link.mavlink.truth import truths_in
 from risaf_link.pipeline import Pipeline
+
+LOG: Peer = ("log", "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,18 +39,31 @@ class Selection:
     start: float = 0.0  # of the log's own time, from its first record
     end: float = math.inf
     outages: tuple[tuple[float, float], ...] = ()  # from the first sample
+    fixed: tuple[str, ...] = ()  # parameters that ground stations in the log do not set
 
 
 class OutputLog:
-    """What the service would have sent, as a tlog."""
+    """What the service would have sent, as a tlog.
 
-    def __init__(self, config: Config, file: BinaryIO) -> None:
+    Parameters
+    ----------
+    config : Config
+    file : file object
+        Written to.
+    identity : Identity or None
+        Of the service, which may change; None: as configured.
+    """
+
+    def __init__(self, config: Config, file: BinaryIO, identity: Identity | None = None) -> None:
         self._file = file
+        self._identity = identity
         self._emitter = Emitter(config.emit, *config.own)
         self._second = -1
 
     def write(self, block: EstimateBlock) -> None:
         """Write the frames of the next estimates, and HEARTBEAT once a second."""
+        if self._identity:
+            self._emitter.system = self._identity.system
         for i, received_us in enumerate(block.received_us.tolist()):
             frames = self._emitter.emit(block.at(i))
             second = received_us // 1_000_000
@@ -69,6 +88,8 @@ class Replay:
 
     Attributes
     ----------
+    identity : Identity
+        Whom the service would have been.
     scorer : Scorer
 
     Raises
@@ -85,6 +106,9 @@ class Replay:
         self._path = path
         self._selection = selection
         self._pipeline = Pipeline(config, config.own, load_calibration(config))
+        self.identity = Identity(*config.own, adopts=config.mavlink.system_id is None)
+        parameters = Parameters(config, fixed=selection.fixed)
+        self._component = Component(parameters, self._pipeline, self.identity, keep=self._keep)
         self._gps = Ingest(config.array, config.gps, config.own)
         self._gps_ids = {IDS[name] for name in config.gps.messages}
         outages = [Outage(*outage) for outage in selection.outages]
@@ -118,7 +142,7 @@ class Replay:
         """
         began = time.perf_counter()
         received_us = 0
-        reader = BlockReader(self._pipeline.ingest, self._pipeline.assembler)
+        reader = BlockReader(self._pipeline.ingest, self._pipeline.assembler, apart=ORDERS)
         for table, times_us in self._tables(progress):
             received_us = int(times_us[-1])
             for truth in truths_in(table, times_us):
@@ -179,17 +203,45 @@ class Replay:
 
     def _take(self, item: EpochBlock | tuple[Frame, int]) -> Iterator[EstimateBlock]:
         if isinstance(item, EpochBlock):
-            yield from self._noted(self._pipeline.advance(item))
+            yield from self._noted(self._advance(item))
             return
         frame, received_us = item
-        if frame.message_id in self._gps_ids:
+        if frame.message_id in self._gps_ids or frame.message_id in ORDERS:
             yield from self._noted(self._pipeline.release())
-            if self.scorer.is_withheld():
-                fix = self._gps.decode(frame, received_us)
-                if isinstance(fix, GpsFix):
-                    self.scorer.take_withheld(fix)
-                return
+        if frame.message_id in ORDERS:
+            self._order(frame, received_us)
+        if frame.message_id in self._gps_ids and self.scorer.is_withheld():
+            fix = self._gps.decode(frame, received_us)
+            if isinstance(fix, GpsFix):
+                self.scorer.take_withheld(fix)
+            return
         yield from self._noted(self._pipeline.gather(frame, received_us))
+        if self._component.is_calibrating:
+            yield from self._noted(self._observed(self._pipeline.release()))
+
+    def _advance(self, epochs: EpochBlock) -> list[EstimateBlock]:
+        if not self._component.is_calibrating:
+            return self._pipeline.advance(epochs)
+        singles = map(self._pipeline.advance, epochs.each())
+        return [block for blocks in singles for block in self._observed(blocks)]
+
+    def _order(self, frame: Frame, received_us: int) -> None:
+        """Take what another component said as the live run did, after all that came before it."""
+        if self._last:
+            self._component.observe(self._last.at(len(self._last) - 1))
+        self._component.receive(frame, LOG, received_us)
+        self._component.collect(())  # the answers are in the log
+        self._gps.own = self._pipeline.ingest.own
+
+    def _observed(self, blocks: list[EstimateBlock]) -> list[EstimateBlock]:
+        for block in blocks:
+            for estimate in block:
+                self._component.observe(estimate)
+        return blocks
+
+    def _keep(self, parameters: dict[str, float]) -> None:
+        """Take what a ground station has stored for stored; nothing is written."""
+        self._component.kept(parameters)
 
     def _noted(self, blocks: list[EstimateBlock]) -> list[EstimateBlock]:
         for block in blocks:

@@ -5,21 +5,26 @@ import logging
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from risaf_link.config import Config, LinkParameters, load_calibration
+from risaf_link.config import Config, load_calibration
 from risaf_link.core.estimate import Estimate
+from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.links import Link, TlogLink, open_link
+from risaf_link.mavlink.commands import Peer
+from risaf_link.mavlink.component import Component
 from risaf_link.mavlink.frame import FrameParser
-from risaf_link.mavlink.telemetry import ComponentState, Emitter
+from risaf_link.mavlink.identity import Identity
+from risaf_link.mavlink.parameters import Parameters
 from risaf_link.pipeline import Pipeline
 
-HEARTBEAT_S = 1.0
-STALLED_S = 2.0  # without an epoch
+TICK_S = 0.1  # from one look at what is due by time to the next
 MOST_PEERS = 256  # of all links together
+PARAM_VALUE_BYTES = 37  # of a PARAM_VALUE frame
+PARAMETERS_SHARE = 0.4  # of a link, that a list of parameters takes at most
 
 _log = logging.getLogger(__name__)
 
@@ -47,6 +52,8 @@ class Service:
     Parameters
     ----------
     config : Config
+    kept : KeptParameters
+        What was set over MAVLink before, and where it is kept.
     clock_us : callable
         Microseconds since 1970.
 
@@ -56,20 +63,32 @@ class Service:
         If the calibration cannot be used.
     """
 
-    def __init__(self, config: Config, clock_us: Callable[[], int] = unix_us) -> None:
-        self.pipeline = Pipeline(config, config.own, load_calibration(config))
+    def __init__(
+        self,
+        config: Config,
+        kept: KeptParameters = NOTHING_KEPT,
+        clock_us: Callable[[], int] = unix_us,
+    ) -> None:
+        parameters = Parameters(config, kept.values, kept.overruled)
+        self.pipeline = Pipeline(parameters.tuned, config.own, load_calibration(config))
+        self.links = [open_link(link.url, link.name, clock_us) for link in config.links]
         self._clock_us = clock_us
-        self._ports = [self._port(config, link) for link in config.links]
-        self._recordings = [link for link, _ in self._ports if isinstance(link, TlogLink)]
+        self._kept = kept
+        self._storing: set[asyncio.Task[None]] = set()
+        self._component = Component(
+            parameters,
+            self.pipeline,
+            Identity(*config.own, adopts=config.mavlink.system_id is None),
+            rates={link.name: link.emit for link in config.links if link.emit is not None},
+            pace={link.name: _pace(link) for link in self.links},
+            keep=self._keep if kept.path else None,
+        )
+        self._by_name = {link.name: link for link in self.links}
+        self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
         self._frames = 0
         self._received_us = 0
         self._mismatch = ""
-
-    @property
-    def links(self) -> list[Link]:
-        """The links, in the order of the configuration."""
-        return [link for link, _ in self._ports]
 
     @property
     def dropped(self) -> Counter[str]:
@@ -92,11 +111,6 @@ class Service:
             counts = self.pipeline.assembler.counts
             _log.info("ended: %d frames, %d epochs", self._frames, counts["epochs"])
 
-    def _port(self, config: Config, link: LinkParameters) -> tuple[Link, Emitter | None]:
-        rates = config.emit if link.emit is None else link.emit
-        emitter = Emitter(rates, *config.own) if rates else None
-        return open_link(link.url, link.name, self._clock_us), emitter
-
     def _receive(self, link: Link, data: bytes, peer: str) -> None:
         """Take what came over a link, and send what comes of it."""
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
@@ -104,14 +118,35 @@ class Service:
             self._frames += 1
             for recording in self._recordings:
                 recording.record(received_us, frame.raw)
+            self._component.receive(frame, (link.name, peer), received_us)
             self._send(self.pipeline.step(frame, received_us))
+        self._hand_out(self._component.collect(self._peers()))
         self._tell_mismatch()
 
     def _send(self, estimates: list[Estimate]) -> None:
+        peers = list(self._peers()) if estimates else []
         for estimate in estimates:
-            for link, emitter in self._ports:
-                for raw in emitter.emit(estimate) if emitter else ():
-                    link.send(raw)
+            self._component.observe(estimate)
+            self._hand_out(self._component.emit(estimate, peers))
+
+    def _peers(self) -> Iterator[Peer]:
+        return ((link.name, peer) for link in self.links for peer in link.peers)
+
+    def _hand_out(self, frames: list[tuple[Peer, bytes]]) -> None:
+        for (link, peer), raw in frames:
+            self._by_name[link].send_to(raw, peer)
+
+    def _keep(self, parameters: dict[str, float]) -> None:
+        """Store parameters without waiting: a memory card can take longer than an epoch."""
+
+        async def store() -> None:
+            failure = await asyncio.to_thread(self._kept.write, parameters)
+            self._component.kept(parameters, failure)
+            self._hand_out(self._component.collect(self._peers()))
+
+        task = asyncio.create_task(store())
+        self._storing.add(task)
+        task.add_done_callback(self._storing.discard)
 
     def _parser(self, link: str, peer: str) -> FrameParser:
         parser = self._parsers.pop((link, peer), None) or FrameParser()
@@ -122,19 +157,19 @@ class Service:
 
     def _tell_mismatch(self) -> None:
         if self.pipeline.mismatch != self._mismatch:
-            self._mismatch = self.pipeline.mismatch
+            self._mismatch = self._component.trouble = self.pipeline.mismatch
             if self._mismatch:
                 _log.error("no estimates: array.calibration: %s", self._mismatch)
 
     async def _beat(self) -> None:
-        """Send HEARTBEAT once a second; what it says follows the estimator's progress."""
-        epochs, still_s = 0, 0.0
+        """Do what is due by time; HEARTBEAT follows the estimator's progress."""
+        loop = asyncio.get_running_loop()
         while True:
-            progress = self.pipeline.assembler.counts["epochs"]
-            still_s = 0.0 if progress != epochs else still_s + HEARTBEAT_S
-            epochs = progress
-            state = ComponentState.ACTIVE if still_s < STALLED_S else ComponentState.CRITICAL
-            for link, emitter in self._ports:
-                if emitter:
-                    link.send(emitter.heartbeat(state if epochs else ComponentState.BOOT))
-            await asyncio.sleep(HEARTBEAT_S)
+            self._component.advance(round(loop.time() * 1e6))
+            self._hand_out(self._component.collect(self._peers()))
+            await asyncio.sleep(TICK_S)
+
+
+def _pace(link: Link) -> float:
+    """How many PARAM_VALUE a second a link carries beside all else."""
+    return PARAMETERS_SHARE * link.bytes_per_s / PARAM_VALUE_BYTES

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from filters import DEFAULTS, fused
+from msgspec import structs
 
 from risaf_link.core import aiding, eskf, kernel
 from risaf_link.core.earth import GRAVITY
@@ -14,6 +15,9 @@ from risaf_link.core.rotation import wrap
 pytestmark = pytest.mark.skipif(
     not kernel.BUILT, reason="no kernel was built: that takes a C++ compiler"
 )
+
+
+OTHERS = structs.replace(DEFAULTS, common_noise=1e-4, turn_error=1e-3, gate=3.0, distrust=4.0)
 
 
 def readings(seed, steps):
@@ -45,6 +49,8 @@ def test_the_kernel_s_filter_is_that_of_the_python_form(seed):
         corrections = []
         course = yaw + 0.02 * generator.normal() + (0.5 if step % 1000 > 900 else 0.0)
         for estimator, aid in zip(filters, aids, strict=True):
+            if step == 4000:
+                estimator.configure(OTHERS, HeadingParameters(offset_std=0.02, delay_std=0.2))
             estimator.predict(fused(rate, dt=dt), dt)
             made = list(aid.take(estimator, fused(rate, dt=dt), force, dt))
             if step % 20 == 0 and step % 3000 < 2000:

@@ -13,6 +13,7 @@ LAYERS = [
     {"pipeline"},
     {"links", "publish", "sim"},
     {"config", "sweep"},
+    {"kept"},
     {"service", "replay", "survey", "calibrate", "experiments"},
     {"fleet", "words"},
     {"cli"},

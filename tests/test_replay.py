@@ -8,12 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from logs import simulated
+from vehicle import Vehicle
+from wire import frame
 
 from risaf_link.config import Config, load
 from risaf_link.core.rotation import wrap
+from risaf_link.mavlink.component import Component
 from risaf_link.mavlink.dialect import IDS, pack
-from risaf_link.mavlink.frame import encode
+from risaf_link.mavlink.frame import Frame, encode
+from risaf_link.mavlink.identity import Identity
+from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.tlog import TlogReader, record
+from risaf_link.pipeline import Pipeline
 from risaf_link.publish.rows import COLUMNS, RowWriter
 from risaf_link.replay import OutputLog, Replay, Selection
 
@@ -188,3 +194,73 @@ class TestRecordings:
         assert outage["reference"] == "truth"
         assert (outage["start_s"], outage["end_s"]) == pytest.approx((73.3, 229.4), abs=0.2)
         assert 0 < outage["rmse_deg"] < 15
+
+
+def a_log(path: Path, *orders: Frame, system: int = 1) -> Path:
+    """Six seconds of an array and an autopilot; a ground station's orders after two."""
+    vehicle = Vehicle(3)
+    sent = [(1_000_000, vehicle.info())]
+    for k in range(600):
+        time_us = 1_000_000 + 10_000 * k
+        if k % 100 == 0:
+            sent.append((time_us, frame("HEARTBEAT", (system, 1), type=10, autopilot=3)))
+        if k == 200:
+            sent += [(time_us, order) for order in orders]
+        sent.append((time_us, vehicle.epoch(time_us, (0.0, 0.0, 0.001 * k))))
+    path.write_bytes(b"".join(record(time_us, one.raw) for time_us, one in sent))
+    return path
+
+
+def order(name: str, value: float) -> Frame:
+    told = {"param_id": name.encode(), "param_value": value, "param_type": 9}
+    return frame("PARAM_SET", (255, 190), target_system=1, target_component=191, **told)
+
+
+def test_the_output_speaks_under_the_id_of_the_one_autopilot(tmp_path):
+    replay = Replay(Config(), a_log(tmp_path / "d.tlog", system=7), Selection())
+    file = io.BytesIO()
+    output = OutputLog(Config(), file, replay.identity)
+    for block in replay.blocks(singly=True):
+        output.write(block)
+    systems = [logged.frame.system for logged in TlogReader([file.getvalue()])]
+    assert (systems[0], systems[-1], set(systems)) == (1, 7, {1, 7})
+
+
+def test_what_a_ground_station_set_holds_but_for_what_is_chosen_now(tmp_path):
+    ordered = a_log(tmp_path / "ordered.tlog", order("ATT_NOISE", 0.5))
+
+    def final_std(log: Path, fixed: tuple[str, ...] = ()) -> float:
+        *_, last = Replay(Config(), log, Selection(fixed=fixed)).blocks()
+        return last.at(len(last) - 1).attitude.roll_std
+
+    alone = final_std(a_log(tmp_path / "alone.tlog"))
+    assert final_std(ordered) > 2 * alone
+    assert final_std(ordered, fixed=("ATT_NOISE",)) == alone
+
+
+@pytest.mark.parametrize("singly", [False, True])
+def test_a_calibration_that_a_ground_station_ordered_is_done_again_to_the_bit(tmp_path, singly):
+    told = {"target_system": 1, "target_component": 191, "command": 241, "param1": 1}
+    calibrate = frame("COMMAND_LONG", (255, 190), **told)
+    vehicle, noise = Vehicle(3), np.random.default_rng(1).normal(0, 0.005, (800, 3))
+    sent = [vehicle.info()]
+    sent += [vehicle.epoch(1_000_000 + 10_000 * k, noise[k]) for k in range(800)]
+    sent.insert(60, calibrate)
+
+    def replayed(frames: list[Frame]) -> np.ndarray:
+        log = tmp_path / "d.tlog"
+        log.write_bytes(b"".join(record(4 * k, one.raw) for k, one in enumerate(frames, 10**9)))
+        blocks = Replay(Config(), log, Selection()).blocks(singly=singly)
+        return np.array([estimate.attitude.q_nb for block in blocks for estimate in block])
+
+    pipeline = Pipeline(Config(), Config().own)
+    component = Component(Parameters(Config()), pipeline, Identity(1, 191, adopts=True))
+    live = []
+    for k, one in enumerate(sent, 10**9):
+        component.receive(one, ("array", ""), 4 * k)
+        for estimate in pipeline.step(one, 4 * k):
+            component.observe(estimate)
+            live.append(estimate.attitude.q_nb)
+    assert (replayed(sent) == np.array(live)).all()
+    differs = (replayed([one for one in sent if one is not calibrate]) != live).any(axis=1)
+    assert int(differs.argmax()) in range(550, 570)

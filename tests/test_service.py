@@ -18,7 +18,8 @@ from risaf_link.config import Config, load
 from risaf_link.links import UdpInLink
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import Frame, FrameParser
-from risaf_link.mavlink.tlog import TlogReader
+from risaf_link.mavlink.peers import EMITTED
+from risaf_link.mavlink.tlog import TlogReader, record
 from risaf_link.replay import OutputLog, Replay, Selection
 from risaf_link.service import Service
 from risaf_link.sim.scenario import scenario
@@ -123,7 +124,7 @@ async def feed(ground: Ground, service: Service, sent: list[list[bytes]]) -> lis
 
 
 def outputs(heard: list[Frame]) -> list[tuple[int, bytes]]:
-    return [(f.message_id, f.payload) for f in heard if f.message_id != IDS["HEARTBEAT"]]
+    return [(f.message_id, f.payload) for f in heard if f.message_id in EMITTED]
 
 
 def replayed(config: Config, log: Path) -> list[tuple[int, bytes]]:
@@ -161,6 +162,48 @@ async def test_a_recording_replays_to_the_same_outputs_bit_for_bit(ground, tmp_p
     live = outputs(ground.heard)
     assert len(live) > EPOCHS
     assert replayed(config, recording) == live
+
+
+async def test_what_a_ground_station_sets_is_in_the_recording_and_replays_bit_for_bit(
+    ground, tmp_path
+):
+    recording = tmp_path / "drive.tlog"
+    config = config_for(ground, f"{{name: recording, url: 'tlog://{recording}'}}")
+    codec = public.MAVLink(None, 255, 190)
+    orders = {
+        20: codec.param_set_encode(1, 191, b"FUS_METHOD", 3, 9),
+        35: codec.command_long_encode(1, 191, 246, 0, 1, 0, 0, 0, 0, 0, 0),
+    }
+    async with Running(config, up=3) as service:
+        for k, burst in enumerate(bursts()):
+            if k in orders:
+                ground.transport.sendto(orders[k].pack(codec), address_of(service))
+            await feed(ground, service, [burst])
+    live = outputs(ground.heard)
+    assert replayed(config, recording) == live
+    recording.write_bytes(without(recording.read_bytes(), {IDS["PARAM_SET"]}))
+    assert replayed(config, recording) != live
+
+
+def without(log: bytes, message_ids: set[int]) -> bytes:
+    kept = (one for one in TlogReader([log]) if one.frame.message_id not in message_ids)
+    return b"".join(record(one.time_us, one.frame.raw) for one in kept)
+
+
+async def test_a_client_that_does_not_read_costs_only_itself(ground):
+    port = "tcpin://127.0.0.1:0"
+    config = config_for(ground, f"{{name: clients, url: '{port}'}}")
+    async with Running(config, up=3) as service:
+        host, _, number = service.links[2].address.partition(":")
+        slow = socket.create_connection((host, int(number)))
+        await until(lambda: service.links[2].peers)
+        (client,) = service.links[2]._clients
+        client.pause_writing()  # its buffer is full, as after some seconds of silence
+        before = service.links[1].counts.dropped_out
+        assert len(await feed(ground, service, bursts())) == EPOCHS
+        slow.close()
+    assert service.links[2].counts.dropped_out >= EPOCHS
+    assert service.links[1].counts.dropped_out == before
 
 
 async def test_heartbeat_tells_whether_epochs_come(ground):

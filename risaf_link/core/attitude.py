@@ -23,6 +23,7 @@ from risaf_link.core.rotation import (
     wrap,
     yaw_of,
 )
+from risaf_link.core.tunable import Tunable
 
 ATTITUDE = slice(0, 4)  # q_nb (w, x, y, z)
 BIAS = slice(4, 7)  # bias of the fused rate, rad/s, body
@@ -39,29 +40,39 @@ class AttitudeParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """What the attitude filters assume of the array and of the world. Defaults: consumer MEMS."""
 
     filter: Literal["eskf", "paper"] = "eskf"
-    initial_bias_std: Annotated[float, Meta(gt=0)] = 0.01
-    """rad/s: 0.6 deg/s, the zero-rate offset of a good consumer gyro."""
-    initial_tilt_std: Annotated[float, Meta(gt=0)] = 0.05
-    """rad, where no accelerometer tells: a road vehicle stands level within 3 deg."""
-    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6
-    """`paper`: rad/s/sqrt(s), of the fused rate."""
-    common_noise: Annotated[float, Meta(ge=0)] = 2e-5
-    """`eskf`: rad/s/sqrt(Hz), that no averaging takes away: vibration, the board's own motion."""
-    common_bias_walk: Annotated[float, Meta(ge=0)] = 5e-7
-    """`eskf`: rad/s/sqrt(s), of all sensors together: the board's temperature."""
-    scale_std: Annotated[float, Meta(ge=0)] = 5e-3
-    """`eskf`: scale factor and misalignment, rad, that calibration left: 0.5 %, 0.3 deg."""
-    turn_error: Annotated[float, Meta(ge=0)] = 3e-4
-    """`eskf`: rad for each sqrt(rad) turned: what of the rate's error is not linear."""
-    accel_bias_std: Annotated[float, Meta(gt=0)] = 0.05
-    """`eskf`: m/s^2: 5 mg, of an accelerometer calibrated once; it tilts the apparent vertical by
-    0.3 deg."""
-    gate: Annotated[float, Meta(gt=0)] = 5.0
-    """`eskf`: standard deviations within which gravity and rest are fused."""
-    gravity_distrust: Annotated[float, Meta(gt=0)] = 3.0
-    """`eskf`: s of rejection after which the tilt, not gravity, is held to be wrong."""
-    distrust: Annotated[float, Meta(gt=0)] = 10.0
-    """`eskf`: s of rest that contradicts the bias after which the bias is held to be wrong."""
+    """Eskf: error state, aided by heading, gravity and rest; paper: the seven-state EKF, aided by
+    heading alone."""
+    initial_bias_std: Annotated[
+        float, Meta(gt=0, le=10), Tunable("ATT_BIAS_STD", "rad/s", at_start=True)
+    ] = 0.01
+    """bias at the start: 0.6 deg/s, the zero-rate offset of a good consumer gyro."""
+    initial_tilt_std: Annotated[
+        float, Meta(gt=0, le=10), Tunable("ATT_TILT_STD", "rad", at_start=True)
+    ] = 0.05
+    """roll and pitch at the start, where no accelerometer tells: a road vehicle stands level within
+    3 deg."""
+    bias_walk: Annotated[float, Meta(ge=0, le=1), Tunable("ATT_BIAS_WALK", "rad/s/sqrt(s)")] = 5e-6
+    """paper: how fast the fused rate's bias wanders."""
+    common_noise: Annotated[float, Meta(ge=0, le=1), Tunable("ATT_NOISE", "rad/s/sqrt(Hz)")] = 2e-5
+    """eskf: noise that all sensors have in common: vibration."""
+    common_bias_walk: Annotated[
+        float, Meta(ge=0, le=1), Tunable("ATT_COMMON_WALK", "rad/s/sqrt(s)")
+    ] = 5e-7
+    """eskf: bias walk that all sensors have in common: the board's temperature."""
+    scale_std: Annotated[float, Meta(ge=0, le=1), Tunable("ATT_SCALE_STD", at_start=True)] = 5e-3
+    """eskf: scale factor and misalignment (rad) that calibration left: 0.5 %, 0.3 deg."""
+    turn_error: Annotated[float, Meta(ge=0, le=1), Tunable("ATT_TURN_ERR", "rad/sqrt(rad)")] = 3e-4
+    """eskf: for each sqrt(rad) turned, what of the rate's error is not linear."""
+    accel_bias_std: Annotated[
+        float, Meta(gt=0, le=100), Tunable("ATT_ACC_BIAS", "m/s^2", at_start=True)
+    ] = 0.05
+    """eskf: of the fused accelerometers, 5 mg; it tilts the apparent vertical by 0.3 deg."""
+    gate: Annotated[float, Meta(gt=0, le=1000), Tunable("ATT_GATE", "standard deviations")] = 5.0
+    """eskf: within which gravity and rest are fused."""
+    gravity_distrust: Annotated[float, Meta(gt=0, le=1e6), Tunable("ATT_GRAV_TIME", "s")] = 3.0
+    """eskf: of rejected gravity after which the tilt is taken to be wrong."""
+    distrust: Annotated[float, Meta(gt=0, le=1e6), Tunable("ATT_REST_TIME", "s")] = 10.0
+    """eskf: of rest that contradicts the bias until the bias is taken to be wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +142,22 @@ class PaperFilter:
         self._waiting = 0.0  # s, for a rate
         self._yaws: deque[tuple[float, float]] = deque(maxlen=YAW_HISTORY)  # without corrections
         self._yaw_corrections = 0.0  # their sum
+
+    def configure(self, parameters: AttitudeParameters) -> None:
+        """Take new parameters; the state stays, and with it what they say of the start."""
+        self._parameters = parameters
+        self._bias_walk = np.diag([0.0] * 4 + [parameters.bias_walk**2] * 3)
+
+    def set_bias(self, rate_b: Floats, variance: Floats) -> None:
+        """Believe the mean rate of a vehicle that rests to be the bias, whatever it was held to be.
+
+        Parameters are those of `Estimator.set_bias`.
+        """
+        self._bias = rate_b.copy()
+        covariance = self._covariance.copy()
+        covariance[BIAS] = covariance[:, BIAS] = 0.0
+        covariance[BIAS, BIAS] = np.diag(variance)
+        self._covariance = covariance
 
     def predict(self, fused: FusedRate, dt: float) -> None:
         """Carry the state on to the time of a fused rate: eq. 3 to first order, eq. 9 to 11.

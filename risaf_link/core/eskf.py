@@ -148,6 +148,11 @@ class Eskf:
         self._rejecting: dict[str, tuple[float, float]] = {}  # source: since when, last
         self._rested = -math.inf  # when rest was last fused
 
+    def configure(self, parameters: AttitudeParameters, heading: HeadingParameters) -> None:
+        """Take new parameters; the state stays, and with it what they say of the start."""
+        self._parameters = parameters
+        self._wrong_variance = np.array([heading.offset_std**2, heading.delay_std**2])
+
     def set_latitude(self, latitude: float) -> None:
         """Tell where on earth the vehicle is, rad; before, the earth does not turn."""
         if abs(latitude) <= math.pi / 2:

@@ -13,6 +13,8 @@ from msgspec import structs
 
 from risaf_link.core import kernel
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation, PaperFilter
+from risaf_link.core.earth import EARTH_RATE
+from risaf_link.core.eskf import BIAS_AXES
 from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion
@@ -51,7 +53,12 @@ class Estimator:
         self.fusion = FUSIONS[fusion.method](fusion)
         self._force_fusion = kernel.Robust(structs.replace(fusion, resolution=FORCE_RESOLUTION))
         self.elapsed = 0.0
-        self._delay = heading.delay
+        self._parameters = fusion, attitude, heading
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the filter, and what aids and guards it, anew; the array stays known."""
+        _, attitude, heading = self._parameters
         self._filter: kernel.Eskf | PaperFilter
         if attitude.filter == "eskf":
             self._filter = kernel.Eskf(attitude, heading)
@@ -59,6 +66,43 @@ class Estimator:
             self._filter = PaperFilter(attitude)
         self._aiding = kernel.Aiding(attitude)  # of the Eskf
         self._guard = HeadingGuard(heading, not isinstance(self._filter, PaperFilter))
+
+    def configure(
+        self, fusion: FusionParameters, attitude: AttitudeParameters, heading: HeadingParameters
+    ) -> None:
+        """Take new parameters; what was learnt stays.
+
+        Another method of fusion starts anew; another filter waits for `restart`, and so does what
+        is said of the filter's start.
+        """
+        before, *_ = self._parameters
+        self._parameters = fusion, attitude, heading
+        if fusion.method != before.method:
+            self.fusion = FUSIONS[fusion.method](fusion)
+        self.fusion.configure(fusion)
+        self._force_fusion.configure(structs.replace(fusion, resolution=FORCE_RESOLUTION))
+        if isinstance(self._filter, PaperFilter):
+            self._filter.configure(attitude)
+        else:
+            self._filter.configure(attitude, heading)
+        self._guard.configure(heading)
+
+    def set_bias(self, rate_b: Floats, variance: Floats) -> None:
+        """Believe the mean rate of a vehicle that rests, whatever the bias was held to be.
+
+        Parameters
+        ----------
+        rate_b, variance : ndarray, shape (3,)
+            Mean of the fused rate, bias not taken off, rad/s, and its variance.
+        """
+        if isinstance(self._filter, PaperFilter):
+            self._filter.set_bias(rate_b, variance)
+            return
+        covariance = self._filter.covariance
+        error = rate_b - self._filter.state(0).bias_b
+        covariance[BIAS_AXES, BIAS_AXES] += float(error @ error) + EARTH_RATE**2
+        self._filter.set_covariance(covariance)
+        self._filter.correct_zero_rate(rate_b, variance, confirmed=True)
 
     def advance(self, dt: Floats, rates_b: Floats, forces_b: Floats) -> tuple[Track, Floats]:
         """Carry the estimate on over k epochs, at least one.
@@ -116,5 +160,5 @@ class Estimator:
                 self._aiding.speed.turn_round()
             if motion.along and motion.is_news and not motion.contradicted:
                 ahead = self._guard.ahead(motion)
-                self._aiding.speed.hear(ahead, motion.speed_std**2, self._delay)
+                self._aiding.speed.hear(ahead, motion.speed_std**2, self._parameters[2].delay)
         return innovation

@@ -8,7 +8,7 @@ Inside, the readings stand by channel, shape (3, n), since NumPy is quickest alo
 reading that is not finite is not valid.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from risaf_link.core.health import ArrayHealth, SilenceMonitor
 from risaf_link.core.rotation import Floats
+from risaf_link.core.tunable import Tunable
 
 MAD_TO_STD = 1.4826
 """Makes the median absolute deviation of Gaussian values their standard deviation: Rousseeuw and
@@ -27,32 +28,38 @@ Croux, "Alternatives to the Median Absolute Deviation", JASA 88, 1993."""
 class FusionParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """How the sensors of an array become one rate."""
 
-    method: Literal["robust", "risaf", "median", "mean"] = "robust"
-    gyro_noise: Annotated[float, Meta(gt=0)] = 2e-4
-    """rad/s/sqrt(Hz), of one sensor; where fewer than two are behind a rate and none can tell."""
-    bias_walk: Annotated[float, Meta(ge=0)] = 5e-6
-    """rad/s/sqrt(s), of one sensor: 0.02 deg/s in an hour. `robust` goes by what it sees of it the
-    more, the more sensors there are."""
-    gate: Annotated[float, Meta(ge=2)] = 4.0
-    """`robust`: standard deviations from the rest beyond which a reading is rejected, and a
-    residual is an alarm. Of Gaussian readings one in 16000; a smaller gate costs good sensors."""
-    bias_time: Annotated[float, Meta(ge=5)] = 100.0
-    """`robust`: s in which relative biases are learnt. Long against bursts, of which the undetected
-    part is absorbed in inverse proportion; short against the hours of ageing and temperature."""
-    hold_time: Annotated[float, Meta(ge=0)] = 5.0
-    """`robust`: s without an alarm that make a sensor trusted: some decay times of a burst's tail.
-    A longer one costs the sensors that are hit often: at 20 s most never come back."""
-    resolution: Annotated[float, Meta(ge=0)] = 3e-4
-    """`robust`: rad/s; no sensor is blamed for less: several counts' worth of rounding."""
-    scale_error: Annotated[float, Meta(ge=0)] = 5e-3
-    """`robust`: standard deviation of scale factor and misalignment: no sensor is blamed for so
-    much of the rate, times the gate. 0.5 %: a consumer gyro, not calibrated; few sensors do not
-    show it themselves."""
-    alpha: Annotated[float, Meta(ge=0, lt=1)] = 0.995
-    """`risaf`, eq. 5: memory of a relative bias, an epoch."""
-    lower_quantile: Annotated[float, Meta(ge=0, le=0.5)] = 0.20
-    """`risaf`, eq. 6."""
-    upper_quantile: Annotated[float, Meta(ge=0.5, le=1)] = 0.80
+    method: Annotated[Literal["robust", "risaf", "median", "mean"], Tunable("FUS_METHOD")] = (
+        "robust"
+    )
+    """robust: trust by sensor and slow biases, for arrays that are shocked; risaf: relative bias
+    and percentile gate, the paper's; median; mean."""
+    gyro_noise: Annotated[float, Meta(gt=0, le=1), Tunable("FUS_GYRO_NOISE", "rad/s/sqrt(Hz)")] = (
+        2e-4
+    )
+    """of one sensor; used where fewer than two are behind a rate, which cannot tell."""
+    bias_walk: Annotated[float, Meta(ge=0, le=1), Tunable("FUS_BIAS_WALK", "rad/s/sqrt(s)")] = 5e-6
+    """of one sensor: 0.02 deg/s in an hour; robust goes by what it sees instead, the more sensors
+    the more."""
+    gate: Annotated[float, Meta(ge=2, le=1000), Tunable("FUS_GATE", "standard deviations")] = 4.0
+    """robust: from the rest, beyond which a reading is rejected; of Gaussian ones one in 16000, a
+    tighter gate costs good sensors."""
+    bias_time: Annotated[float, Meta(ge=5, le=1e6), Tunable("FUS_BIAS_TIME", "s")] = 100.0
+    """robust: in which relative biases are learnt: long against bursts, of which a part is
+    absorbed; short against warming up."""
+    hold_time: Annotated[float, Meta(ge=0, le=1e6), Tunable("FUS_HOLD_TIME", "s")] = 5.0
+    """robust: without an alarm until a sensor is trusted: some decay times of a burst's tail; at 20
+    s, sensors that are hit often never come back."""
+    resolution: Annotated[float, Meta(ge=0, le=1), Tunable("FUS_RESOLUTION", "rad/s")] = 3e-4
+    """robust: no sensor is blamed for less; several counts' worth of rounding."""
+    scale_error: Annotated[float, Meta(ge=0, le=1), Tunable("FUS_SCALE_ERR")] = 5e-3
+    """robust: of scale factors and misalignments, one standard deviation; no sensor is blamed for
+    so much of the rate. Less if the array is calibrated."""
+    alpha: Annotated[float, Meta(ge=0, lt=1), Tunable("FUS_ALPHA")] = 0.995
+    """risaf, eq. 5: memory of a relative bias, per epoch: 2 s at 100 Hz."""
+    lower_quantile: Annotated[float, Meta(ge=0, le=0.5), Tunable("FUS_LOWER_Q")] = 0.20
+    """risaf, eq. 6: readings below this quantile of the array are left out."""
+    upper_quantile: Annotated[float, Meta(ge=0.5, le=1), Tunable("FUS_UPPER_Q")] = 0.80
+    """risaf, eq. 6: readings above this one, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +97,15 @@ class EpochBlock:
     def __len__(self) -> int:
         return len(self.time_us)
 
+    def each(self) -> "Iterator[EpochBlock]":
+        """The epochs, one by one."""
+        for i in range(len(self)):
+            one = slice(i, i + 1)
+            rates_b, forces_b = self.rates_b[one], self.forces_b[one]
+            yield EpochBlock(
+                self.time_us[one], self.dt[one], rates_b, forces_b, self.received_us[one]
+            )
+
 
 @dataclass(frozen=True, slots=True)
 class FusedRate:
@@ -106,6 +122,10 @@ class FusedRate:
 
 class Fusion(Protocol):
     """What every method of fusion can do."""
+
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        ...
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""
@@ -137,6 +157,10 @@ class Risaf:
     def relative_bias(self) -> Floats:
         """Relative bias of each sensor, shape (n, 3), rad/s, as of the last epoch."""
         return self._relative_bias.T
+
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self._parameters = parameters
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
@@ -174,6 +198,10 @@ class Mean:
         self._parameters = parameters
         self._silence = SilenceMonitor()
 
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self._parameters = parameters
+
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
         rates, valid = _channels(epoch)
@@ -191,6 +219,10 @@ class Median:
     def __init__(self, parameters: FusionParameters) -> None:
         self._parameters = parameters
         self._silence = SilenceMonitor()
+
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self._parameters = parameters
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""

@@ -104,7 +104,7 @@ class Dispute:
     """
 
     def __init__(self, longest: float) -> None:
-        self._longest = longest
+        self.longest = longest
         self._since = 0.0
         self._rejected: deque[tuple[float, float, float]] = deque()  # s, rad, rad^2
 
@@ -117,7 +117,7 @@ class Dispute:
         if not self._rejected:
             self._since = time_s
         self._rejected.append((time_s, error, variance))
-        while time_s - self._rejected[0][0] > self._longest:
+        while time_s - self._rejected[0][0] > self.longest:
             self._rejected.popleft()
 
     def is_won(self, after: float) -> bool:
@@ -166,6 +166,11 @@ class HeadingGuard:
         self._turned = np.zeros((1, 4))  # rad, the rate's integral in body axes; s
         self._aligned = False
         self._confirmed = 0.0  # s for which headings have agreed with yaw
+
+    def configure(self, parameters: HeadingParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self._parameters = parameters
+        self._dispute.longest = LONGEST_DEFENCE * parameters.reset_after
 
     def advance(self, track: Track, elapsed: Floats, dt: Floats) -> None:
         """Take note of k epochs: the time of each, s, and since the one before, (k,).

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from risaf_link.core.attitude import AttitudeState, Innovation
 from risaf_link.core.earth import radii
 from risaf_link.core.rotation import Floats, wrap, yaw_of
+from risaf_link.core.tunable import Tunable
 
 Metres = Annotated[float, Meta(ge=-1000, le=1000)]
 
@@ -37,17 +38,40 @@ ANTENNA_PATIENCE = 10.0  # s for which two antennas that have no yaw now are wai
 class HeadingParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """How a heading is made from GPS fixes, and when it is believed."""
 
-    source: Literal["auto", "velocity", "positions", "positions_raw", "dual_antenna"] = "auto"
-    course_is_heading: Literal["auto", "always", "never"] = "auto"
-    min_speed: Annotated[float, Meta(ge=0)] = 1.0  # m/s
-    gate: Annotated[float, Meta(gt=0)] = 3.0  # standard deviations of the innovation
-    delay: Annotated[float, Meta(ge=0, le=1)] = 0.11  # s from a fix's validity to its arrival
-    delay_std: Annotated[float, Meta(ge=0, le=1)] = 0.1  # s
-    offset_std: Annotated[float, Meta(ge=0, le=1)] = 0.003  # rad, of what does not average out
-    yaw_offset: Annotated[float, Meta(ge=-7, le=7)] = 0.0  # rad, second antenna from forward
-    antenna: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)  # m, forward, right, down
-    timeout: Annotated[float, Meta(gt=0)] = 2.0  # s without a fix until it is gone
-    reset_after: Annotated[float, Meta(gt=0)] = 10.0  # s of rejected headings
+    source: Annotated[
+        Literal["auto", "velocity", "positions", "positions_raw", "dual_antenna"],
+        Tunable("HDG_SOURCE"),
+    ] = "auto"
+    """auto: dual antenna, else velocity, else positions; velocity: course over ground; positions:
+    from fix to fix; positions_raw: the same in degrees of longitude and latitude, as the paper has
+    it; dual_antenna."""
+    course_is_heading: Annotated[Literal["auto", "always", "never"], Tunable("HDG_COURSE")] = "auto"
+    """auto: unless the autopilot's HEARTBEAT is that of an aircraft or a submarine; always; never:
+    two antennas alone tell the heading. A vehicle in reverse is found out."""
+    min_speed: Annotated[float, Meta(ge=0, le=1000), Tunable("HDG_MIN_SPEED", "m/s")] = 1.0
+    """below, course is noise (dual antenna needs no speed)."""
+    gate: Annotated[float, Meta(gt=0, le=1000), Tunable("HDG_GATE", "standard deviations")] = 3.0
+    """of the innovation, beyond which a heading is rejected."""
+    delay: Annotated[float, Meta(ge=0, le=1), Tunable("HDG_DELAY", "s")] = 0.11
+    """from a fix's validity to its arrival; receivers have 0.1 to 0.3."""
+    delay_std: Annotated[float, Meta(ge=0, le=1), Tunable("HDG_DELAY_STD", "s")] = 0.1
+    """how far that may be wrong; eskf learns it in turns."""
+    offset_std: Annotated[float, Meta(ge=0, le=1), Tunable("HDG_OFFSET_STD", "rad")] = 0.003
+    """how far heading may be off for long, by antennas or a crabbing vehicle: yaw is never held to
+    be better known."""
+    yaw_offset: Annotated[float, Meta(ge=-7, le=7), Tunable("HDG_YAW_OFFSET", "rad")] = 0.0
+    """from forward to the right of the second antenna as seen from the first; taken off the yaw of
+    two antennas."""
+    antenna: Annotated[
+        tuple[Metres, Metres, Metres], Tunable(("HDG_ANT_X", "HDG_ANT_Y", "HDG_ANT_Z"), "m")
+    ] = (0.0, 0.0, 0.0)
+    """forward, right and down, from the point that goes where the vehicle points (rear axle) to the
+    antenna, which swings out in a turn."""
+    timeout: Annotated[float, Meta(gt=0, le=1e6), Tunable("HDG_TIMEOUT", "s")] = 2.0
+    """without a new fix after which dead reckoning is declared."""
+    reset_after: Annotated[float, Meta(gt=0, le=1e6), Tunable("HDG_RESET_AFTER", "s")] = 10.0
+    """of rejected headings that agree with one another and the gyros until yaw is set anew; up to
+    six times as long if yaw was confirmed for longer."""
 
 
 class HeadingSource(IntEnum):
@@ -110,7 +134,7 @@ class PositionWitness:
     """
 
     def __init__(self, timeout: float) -> None:
-        self._timeout = timeout
+        self.timeout = timeout
         self._seen: deque[tuple[float, GpsFix, float, float, float]] = deque()
         self._was_borne_out = False
 
@@ -124,7 +148,7 @@ class PositionWitness:
             before_s, before, north, east, way = self._seen[-1]
             timed = fix.time_us and before.time_us
             elapsed = (fix.time_us - before.time_us) / 1e6 if timed else time_s - before_s
-            if not 0 < elapsed <= self._timeout:
+            if not 0 < elapsed <= self.timeout:
                 self._seen.clear()
             for part in (before, fix):  # the trapezoidal rule
                 north += 0.5 * elapsed * part.speed * math.cos(part.course)
@@ -166,6 +190,11 @@ class HeadingFinder:
         self._previous: tuple[GpsFix, float] | None = None
         self._witness = PositionWitness(parameters.timeout)
         self._yaw_s = -math.inf  # when there was a yaw, or could have been for the first time
+
+    def configure(self, parameters: HeadingParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self._parameters = parameters
+        self._witness.timeout = parameters.timeout
 
     def take(self, fix: GpsFix, time_s: float) -> Motion:
         """Use the next fix.
@@ -328,6 +357,10 @@ class HeadingMonitor:
         self._fused_s = math.nan
         self._fused_count = 0
         self._rejected_count = 0
+
+    def configure(self, parameters: HeadingParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self._parameters = parameters
 
     def advance(self, elapsed: Floats, aligned: NDArray[np.bool_]) -> HeadingTrack:
         """Let k epochs pass, with yaw known or not; nothing is noted in between.

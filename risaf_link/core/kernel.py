@@ -44,6 +44,10 @@ class _Mean:
         """Judge the sensors as of the last epoch, by their silence alone."""
         return judge_silence(self.kernel.silent_for())
 
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self.kernel.configure(parameters.gyro_noise, parameters.bias_walk)
+
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
         return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
@@ -60,6 +64,10 @@ class _Median:
         """Judge the sensors as of the last epoch, by their silence alone."""
         return judge_silence(self.kernel.silent_for())
 
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self.kernel.configure(parameters.gyro_noise, parameters.bias_walk)
+
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
         return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
@@ -69,10 +77,11 @@ class _Risaf:
     """`fusion.Risaf` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
-        p = parameters
-        self.kernel = _kernel.Risaf(
-            p.alpha, p.lower_quantile, p.upper_quantile, p.gyro_noise, p.bias_walk
-        )
+        self.kernel = _kernel.Risaf(*_told_risaf(parameters))
+
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self.kernel.configure(*_told_risaf(parameters))
 
     @property
     def relative_bias(self) -> Floats:
@@ -92,15 +101,11 @@ class _Robust:
     """`robust.Robust` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
-        told = _kernel.RobustParameters()
-        for name in _SHARED:
-            setattr(told, name.lower(), getattr(robust, name))
-        told.silent_after = SILENT_AFTER
-        told.mad_factors = robust.MAD_FACTORS.tolist()
-        for name, value in structs.asdict(parameters).items():
-            if hasattr(told, name):
-                setattr(told, name, value)
-        self.kernel = _kernel.Robust(told)
+        self.kernel = _kernel.Robust(_told_robust(parameters))
+
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self.kernel.configure(_told_robust(parameters))
 
     @property
     def relative_bias(self) -> Floats:
@@ -175,6 +180,10 @@ class _Eskf:
     def heading_errors(self) -> Floats:
         """What the headings are held to be off by: rad, s."""
         return np.array(self.kernel.wrong)
+
+    def configure(self, parameters: AttitudeParameters, heading: HeadingParameters) -> None:
+        """Take new parameters; the state stays, and with it what they say of the start."""
+        self.kernel.configure(_numbers(parameters, heading))
 
     def set_latitude(self, latitude: float) -> None:
         """Tell where on earth the vehicle is, rad."""
@@ -274,6 +283,22 @@ def advance(
         return None
     filters = attitude.kernel, aid.kernel
     return _kernel.advance(gyros.kernel, accelerometers.kernel, *filters, dt, rates_b, forces_b)
+
+
+def _told_risaf(p: FusionParameters) -> tuple[float, ...]:
+    return p.alpha, p.lower_quantile, p.upper_quantile, p.gyro_noise, p.bias_walk
+
+
+def _told_robust(parameters: FusionParameters) -> "_kernel.RobustParameters":
+    told = _kernel.RobustParameters()
+    for name in _SHARED:
+        setattr(told, name.lower(), getattr(robust, name))
+    told.silent_after = SILENT_AFTER
+    told.mad_factors = robust.MAD_FACTORS.tolist()
+    for name, value in structs.asdict(parameters).items():
+        if hasattr(told, name):
+            setattr(told, name, value)
+    return told
 
 
 Mean: Callable[[FusionParameters], Fusion] = _Mean if BUILT else fusion.Mean

@@ -148,6 +148,10 @@ class Robust:
         self._calm_walk = np.zeros(3)  # that times the square of a sensor's bias walk
         self._noise = np.full(3, np.nan)  # variance of one active reading
 
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters; what was learnt stays."""
+        self._parameters = parameters
+
     @property
     def relative_bias(self) -> Floats:
         """Relative bias of each sensor, shape (n, 3), rad/s."""

@@ -83,11 +83,11 @@ class Stream(Endpoint, asyncio.Protocol):
 
     def __init__(self, connection: Connection, peer: str = "") -> None:
         super().__init__(connection)
-        self._peer = peer
+        self.peer = peer
 
     def data_received(self, data: bytes) -> None:
         """Hand it on."""
-        self._connection.deliver(data, self._peer)
+        self._connection.deliver(data, self.peer)
 
     def send(self, data: bytes) -> None:
         """Write a frame if there is room for it."""

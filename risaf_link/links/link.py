@@ -2,8 +2,9 @@
 
 import asyncio
 import logging
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 Receive = Callable[[bytes, str], None]
@@ -86,7 +87,14 @@ class Link(ABC):
         What the log calls it.
     backoff : Backoff
         How long it waits before it opens again.
+
+    Attributes
+    ----------
+    bytes_per_s : float
+        What it carries; infinite: not known.
     """
+
+    bytes_per_s = math.inf
 
     def __init__(self, name: str, backoff: Backoff = BACKOFF) -> None:
         self.name = name
@@ -121,6 +129,11 @@ class Link(ABC):
             await asyncio.sleep(delay_s)
             delay_s = min(2 * delay_s, self._backoff.longest_s)
 
+    @property
+    def peers(self) -> Sequence[str]:
+        """Who can be reached now, as far as is known; "" where there is one."""
+        return ("",)
+
     @abstractmethod
     async def _hold(self, connection: Connection) -> None:
         """Open, say `connection.up`, stay until lost (raises OSError), close whatever happens."""
@@ -128,3 +141,7 @@ class Link(ABC):
     @abstractmethod
     def send(self, data: bytes) -> None:
         """Hand one frame to every peer now known; it never waits. What is not taken is counted."""
+
+    def send_to(self, data: bytes, peer: str) -> None:  # noqa: ARG002
+        """Hand one frame to one peer."""
+        self.send(data)

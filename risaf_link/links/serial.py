@@ -30,6 +30,7 @@ class SerialLink(OnePeerLink):
         super().__init__(name, f"{path} at {baud} baud", backoff)
         self._path = path
         self._baud = baud
+        self.bytes_per_s = baud / 10
 
     async def _connect(self, connection: Connection) -> Stream:
         import serialx  # noqa: PLC0415 (70 ms that other links need not wait for)

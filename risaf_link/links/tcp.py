@@ -105,6 +105,19 @@ class TcpInLink(Link):
         for client in self._clients:
             client.send(data)
 
+    @property
+    def peers(self) -> list[str]:
+        """The clients."""
+        return [client.peer for client in self._clients]
+
+    def send_to(self, data: bytes, peer: str) -> None:
+        """Hand one frame to one client; if it has gone the frame is dropped."""
+        for client in self._clients:
+            if client.peer == peer:
+                client.send(data)
+                return
+        self.counts.dropped_out += 1
+
 
 class _Client(_TcpStream):
     """One client of several: its loss does not end the link's connection."""
@@ -118,9 +131,9 @@ class _Client(_TcpStream):
         if len(self._clients) == MOST_CLIENTS or self._connection.lost.done():
             self._transport.abort()
             return
-        self._peer = address_text(transport.get_extra_info("peername"))
+        self.peer = address_text(transport.get_extra_info("peername"))
         self._clients.add(self)
-        _log.info("%s: peer %s: new", self._connection.name, self._peer)
+        _log.info("%s: peer %s: new", self._connection.name, self.peer)
         if len(self._clients) == MOST_CLIENTS:
             _log.warning("%s: no more than %d peers", self._connection.name, MOST_CLIENTS)
 
@@ -129,4 +142,4 @@ class _Client(_TcpStream):
         if self in self._clients:
             self._clients.remove(self)
             reason = error or "closed by it"
-            _log.info("%s: peer %s: gone: %s", self._connection.name, self._peer, reason)
+            _log.info("%s: peer %s: gone: %s", self._connection.name, self.peer, reason)

@@ -156,12 +156,25 @@ class UdpInLink(Link):
         peer, _ = self._peers.pop(address)
         _log.info("%s: peer %s: forgotten", self.name, peer)
 
-    def send(self, data: bytes) -> None:
-        """Hand one frame to everyone who spoke in the last minute; without any it is dropped."""
+    @property
+    def peers(self) -> list[str]:
+        """Those who spoke in the last minute."""
         since_s = self._now_s() - SILENCE_S
         for address in [a for a, (_, heard_s) in self._peers.items() if heard_s < since_s]:
             self._forget(address)
-        if self._socket is None or not self._peers:
+        return [peer for peer, _ in self._peers.values()]
+
+    def send_to(self, data: bytes, peer: str) -> None:
+        """Hand one frame to one of them; if it is not known the frame is dropped."""
+        for address, (name, _) in self._peers.items():
+            if name == peer and self._socket is not None:
+                self._socket.send(data, address)
+                return
+        self.counts.dropped_out += 1
+
+    def send(self, data: bytes) -> None:
+        """Hand one frame to everyone who spoke in the last minute; without any it is dropped."""
+        if self._socket is None or not self.peers:
             self.counts.dropped_out += 1
             return
         for address in self._peers:

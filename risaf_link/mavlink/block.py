@@ -11,7 +11,7 @@ has nothing to do with the array. They are not enough for an epoch, so that does
 The kernel finds the epochs. Where it was not built, every frame is handed on alone.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -53,11 +53,15 @@ class BlockReader:
     ingest : Ingest
     assembler : EpochAssembler
         Of the pipeline: blocks are taken here, what comes alone is taken there.
+    apart : collection of int
+        Ids of messages that are not the pipeline's, and are to be handed on in their place as well.
     """
 
-    def __init__(self, ingest: Ingest, assembler: EpochAssembler) -> None:
+    def __init__(
+        self, ingest: Ingest, assembler: EpochAssembler, apart: Collection[int] = ()
+    ) -> None:
         self._ingest, self._assembler = ingest, assembler
-        self._kinds = _kinds(ingest)
+        self._kinds = _kinds(ingest, apart)
         self._layout: _kernel.ArrayLayout
         self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
         self._finder: _kernel.EpochFinder | None = None
@@ -135,9 +139,9 @@ class BlockReader:
             )
 
 
-def _kinds(ingest: Ingest) -> bytearray:
+def _kinds(ingest: Ingest, apart: Collection[int]) -> bytearray:
     """Kind of every message, by its id."""
-    kinds = dict.fromkeys(ingest.message_ids, Kind.APART)
+    kinds = dict.fromkeys((*apart, *ingest.message_ids), Kind.APART)
     aside = {IDS[name] for name in (*READERS, "HEARTBEAT", "SYSTEM_TIME")}
     kinds |= dict.fromkeys(ingest.refused_ids, Kind.REFUSED)
     kinds |= dict.fromkeys(aside & {*ingest.message_ids, IDS["SYSTEM_TIME"]}, Kind.ASIDE)

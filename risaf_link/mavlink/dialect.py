@@ -13,7 +13,27 @@ from pymavlink.dialects.v20 import all as public_dialect
 
 from risaf_link.mavlink import risaf
 
-MESSAGES: dict[int, Any] = {**public_dialect.mavlink_map, **risaf.mavlink_map}
+
+class ComponentInformationBasic:
+    """COMPONENT_INFORMATION_BASIC of MAVLink's common.xml, which pymavlink 2.4.50 does not have."""
+
+    id = 396
+    msgname = "COMPONENT_INFORMATION_BASIC"
+    fieldnames = (
+        *("time_boot_ms", "capabilities", "time_manufacture_s", "vendor_name", "model_name"),
+        *("software_version", "hardware_version", "serial_number"),
+    )
+    ordered_fieldnames = ("capabilities", "time_boot_ms", *fieldnames[2:])
+    lengths = (1,) * len(fieldnames)
+    crc_extra = 50
+    unpacker = struct.Struct("<QII32s32s24s24s32s")
+
+
+MESSAGES: dict[int, Any] = {
+    ComponentInformationBasic.id: ComponentInformationBasic,
+    **public_dialect.mavlink_map,
+    **risaf.mavlink_map,
+}
 """Message class of the generated dialects, by message id."""
 
 IDS: dict[str, int] = {message.msgname: message_id for message_id, message in MESSAGES.items()}

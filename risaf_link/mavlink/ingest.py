@@ -88,6 +88,8 @@ class Ingest:
 
     Attributes
     ----------
+    own : tuple of int
+        As given; it may be another later.
     counts : Counter
         Frames that were not used: `own`, `malformed`, `unscaled` (nothing has told the scale of
         the array yet), `superseded` (the sensor comes in a better message), `absent` (there is no
@@ -99,7 +101,7 @@ class Ingest:
         self.counts: Counter[str] = Counter()
         self._parameters = array
         self._gps_messages = gps.messages
-        self._own = own
+        self.own = own
         self._arrays, self._receivers = Choice(), Choice()
         self._infos: dict[tuple[int, int, int], ArrayInfo] = {}
         self._imus = Streams(FINEST_FIRST)
@@ -135,7 +137,7 @@ class Ingest:
         read = self._readers.get(frame.message_id)
         if read is None:
             return None
-        if (frame.system, frame.component) == self._own:
+        if (frame.system, frame.component) == self.own:
             self.counts["own"] += 1
             return None
         return read(frame, received_us)
@@ -200,7 +202,7 @@ class Ingest:
         )
         if admitted and has_gyros:
             best_first = wanted.encodings.index(source.encoding)
-            rank = (best_first, int(source.system != self._own[0]), source.component)
+            rank = (best_first, int(source.system != self.own[0]), source.component)
             admitted = self._arrays.admits(source, rank, received_us)
         if not admitted or source != self._arrays.chosen:
             self.counts["other_source"] += 1
@@ -338,7 +340,7 @@ class Ingest:
             self.counts["repeated_fix"] += 1
             return None
         best_first = self._gps_messages.index(name)
-        rank = (int(frame.system != self._own[0]), best_first, frame.component, number)
+        rank = (int(frame.system != self.own[0]), best_first, frame.component, number)
         if not self._receivers.admits(receiver, rank, received_us):
             self.counts["other_source"] += 1
             return None

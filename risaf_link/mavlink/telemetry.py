@@ -3,9 +3,10 @@
 import math
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from risaf_link.core.estimate import Estimate
@@ -22,7 +23,10 @@ Message = Literal[
     "ARRAY_SENSOR_REASON",
 ]
 
-DEFAULT_RATES: dict[Message, float] = {
+Rates = dict[Message, Annotated[float, Meta(gt=0, le=10_000)]]
+"""Hz; what is not named is not sent."""
+
+DEFAULT_RATES: Rates = {
     "ATTITUDE_QUATERNION": 50.0,
     "GPS_HEADING_STATUS": 5.0,
     "ARRAY_STATUS": 1.0,
@@ -46,7 +50,7 @@ class ComponentState(IntEnum):
 
 
 class Emitter:
-    """Makes the frames that go out on one link.
+    """Makes the frames that go to one peer.
 
     Messages are thinned out on the estimate's own time, so that the same input gives the same
     output however fast it comes: of all estimates between two multiples of a message's period the
@@ -58,27 +62,56 @@ class Emitter:
         Message name to Hz; a rate above the array's means every epoch.
     system, component : int
         Whom the frames come from.
+
+    Attributes
+    ----------
+    system : int
+        As given; it may be another later.
     """
 
-    def __init__(self, rates: dict[Message, float], system: int, component: int) -> None:
-        self.rates = rates
-        self._system = system
+    def __init__(self, rates: Rates, system: int, component: int) -> None:
+        self.system = system
+        self._rates = rates
+        self._asked: dict[Message, float] = {}  # Hz, 0: none
+        self._sent = rates  # what is sent in fact
         self._component = component
         self._sequence = 0
         self._next_sensor: dict[str, int] = {}  # of messages that tell of some sensors at a time
         self._periods: dict[str, int] = {}  # which period a message was last sent in
 
+    @property
+    def rates(self) -> Rates:
+        """What is sent, Hz."""
+        return self._sent
+
+    def set_defaults(self, rates: Rates) -> None:
+        """Change what is sent of messages that the peer has not asked for."""
+        self._rates = rates
+        self._sent = {m: rate for m, rate in {**rates, **self._asked}.items() if rate > 0}
+
+    def ask(self, name: Message, rate: float | None) -> None:
+        """Let the peer have a message at so many Hz; 0: not at all, None: by default."""
+        self._asked.pop(name, None)
+        if rate is not None:
+            self._asked[name] = rate
+        self.set_defaults(self._rates)
+
     def emit(self, estimate: Estimate) -> list[bytes]:
         """Frames due at an estimate."""
         frames = []
-        for name, rate in self.rates.items():
+        for name, rate in self._sent.items():
             period = math.floor(estimate.time_us * rate / 1e6)
             if period != self._periods.get(name):
                 self._periods[name] = period
-                frames.append(self._frame(name, **self._fields(name, estimate)))
+                frames.append(self.tell(name, estimate))
         return frames
 
-    def _fields(self, name: str, estimate: Estimate) -> dict[str, Any]:
+    def tell(self, name: Message, estimate: Estimate) -> bytes:
+        """A frame that tells of an estimate, whether it is due or not."""
+        return self.frame(name, **self.fields(name, estimate))
+
+    def fields(self, name: Message, estimate: Estimate) -> dict[str, Any]:
+        """What a message tells of an estimate; where it tells of some sensors, of the next ones."""
         if name not in _ROUND_ROBIN:
             return _FIELDS[name](estimate)
         fields, most = _ROUND_ROBIN[name]
@@ -96,20 +129,25 @@ class Emitter:
 
     def heartbeat(self, state: ComponentState) -> bytes:
         """A HEARTBEAT frame."""
-        return self._frame(
-            "HEARTBEAT",
-            type=ONBOARD_CONTROLLER,
-            autopilot=NO_AUTOPILOT,
-            base_mode=0,
-            custom_mode=0,
-            system_status=state,
-            mavlink_version=MAVLINK_VERSION,
-        )
+        return self.frame("HEARTBEAT", **heartbeat(state))
 
-    def _frame(self, name: str, **fields: Any) -> bytes:
-        frame = encode(*pack(name, **fields), self._sequence, self._system, self._component)
+    def frame(self, name: str, /, **fields: Any) -> bytes:
+        """Any message, from us."""
+        frame = encode(*pack(name, **fields), self._sequence, self.system, self._component)
         self._sequence = (self._sequence + 1) % 256
         return frame
+
+
+def heartbeat(state: ComponentState) -> dict[str, Any]:
+    """Fields of a HEARTBEAT."""
+    return {
+        "type": ONBOARD_CONTROLLER,
+        "autopilot": NO_AUTOPILOT,
+        "base_mode": 0,
+        "custom_mode": 0,
+        "system_status": state,
+        "mavlink_version": MAVLINK_VERSION,
+    }
 
 
 def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:

@@ -164,6 +164,12 @@ class Eskf {
 
   // What others set.
 
+  // Take new parameters; the state stays, and with it what they say of the start.
+  void configure(const FilterNumbers& numbers) {
+    c = numbers;
+    wrong_variance_ = {c.offset_std * c.offset_std, c.delay_std * c.delay_std};
+  }
+
   void set_latitude(double latitude) {
     if (std::abs(latitude) <= PI / 2.0) {
       latitude_ = latitude;

@@ -133,6 +133,7 @@ void bind_filter(nb::module_& m) {
 
   nb::class_<Eskf>(m, "Eskf")
       .def(nb::init<const FilterNumbers&>())
+      .def("configure", &Eskf::configure)
       .def("set_latitude", &Eskf::set_latitude)
       .def("set_attitude", [](Eskf& filter, const std::array<double, 4>& q) {
         filter.set_attitude({q[0], q[1], q[2], q[3]});

@@ -12,6 +12,9 @@ class Mean {
  public:
   Mean(double gyro_noise, double bias_walk) : sensor_{gyro_noise, bias_walk} {}
 
+  // Take new parameters; what was learnt stays.
+  void configure(double gyro_noise, double bias_walk) { sensor_ = {gyro_noise, bias_walk}; }
+
   const Readings& readings() const { return now_; }
 
   // Fuse readings (n, 3); returns how many sensors are valid on all axes.

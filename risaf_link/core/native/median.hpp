@@ -16,6 +16,9 @@ class Median {
   Median(double gyro_noise, double bias_walk, double mad_to_std)
       : sensor_{gyro_noise, bias_walk}, mad_to_std_(mad_to_std) {}
 
+  // Take new parameters; what was learnt stays.
+  void configure(double gyro_noise, double bias_walk) { sensor_ = {gyro_noise, bias_walk}; }
+
   const Readings& readings() const { return now_; }
 
   // Fuse readings (n, 3); returns how many sensors are valid on all axes.

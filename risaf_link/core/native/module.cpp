@@ -109,17 +109,22 @@ NB_MODULE(_kernel, m) {
 
   fusion<risaf::Mean>(m, "Mean")
       .def(nb::init<double, double>(), "gyro_noise"_a, "bias_walk"_a)
+      .def("configure", &risaf::Mean::configure, "gyro_noise"_a, "bias_walk"_a)
       .def("silent_for", &silent_for<risaf::Mean>);
   fusion<risaf::Median>(m, "Median")
       .def(nb::init<double, double, double>(), "gyro_noise"_a, "bias_walk"_a, "mad_to_std"_a)
+      .def("configure", &risaf::Median::configure, "gyro_noise"_a, "bias_walk"_a)
       .def("silent_for", &silent_for<risaf::Median>);
   fusion<risaf::Risaf>(m, "Risaf")
       .def(nb::init<double, double, double, double, double>(), "alpha"_a, "lower_quantile"_a,
+           "upper_quantile"_a, "gyro_noise"_a, "bias_walk"_a)
+      .def("configure", &risaf::Risaf::configure, "alpha"_a, "lower_quantile"_a,
            "upper_quantile"_a, "gyro_noise"_a, "bias_walk"_a)
       .def("silent_for", &silent_for<risaf::Risaf>)
       .def("relative_bias", &relative_bias);
   fusion<risaf::Robust>(m, "Robust")
       .def(nb::init<risaf::RobustParameters>())
+      .def("configure", &risaf::Robust::configure, "parameters"_a)
       .def("health", &health);
 
   bind_filter(m);

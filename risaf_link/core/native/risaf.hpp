@@ -12,8 +12,17 @@ namespace risaf {
 
 class Risaf {
  public:
-  Risaf(double alpha, double lower, double upper, double gyro_noise, double bias_walk)
-      : alpha_(alpha), lower_(lower), upper_(upper), sensor_{gyro_noise, bias_walk} {}
+  Risaf(double alpha, double lower, double upper, double gyro_noise, double bias_walk) {
+    configure(alpha, lower, upper, gyro_noise, bias_walk);
+  }
+
+  // Take new parameters; what was learnt stays.
+  void configure(double alpha, double lower, double upper, double gyro_noise, double bias_walk) {
+    alpha_ = alpha;
+    lower_ = lower;
+    upper_ = upper;
+    sensor_ = {gyro_noise, bias_walk};
+  }
 
   const Readings& readings() const { return now_; }
   const Row& relative_bias(std::size_t axis) const { return axes_[axis].relative_bias; }

@@ -44,6 +44,9 @@ class Robust {
     Selection centres, spreads, slow_centres, slow_spreads;
   };
 
+  // Take new parameters; what was learnt stays.
+  void configure(RobustParameters parameters) { p = std::move(parameters); }
+
   std::size_t sensors() const { return n_; }
   const Axis& axis(std::size_t i) const { return axes_[i]; }
 

@@ -1,0 +1,65 @@
+"""Who we are on the network: part of the vehicle whose autopilot is heard."""
+
+from risaf_link.mavlink.dialect import IDS, reader
+from risaf_link.mavlink.frame import Frame
+
+WINDOW_US = 3_000_000  # after the first autopilot, in which another one may be heard
+GROUND_STATION, NO_AUTOPILOT = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
+ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+ARMED_FOR_US = 5_000_000  # since the last HEARTBEAT
+
+_HEARTBEAT = reader("HEARTBEAT", "type", "autopilot", "base_mode")
+
+
+class Identity:
+    """Our ids, and what is known of the autopilot.
+
+    Autopilots are known by what their HEARTBEAT says, never by their component id.
+
+    Parameters
+    ----------
+    system, component : int
+        Whom we are.
+    adopts : bool
+        Whether the system id of the one autopilot that is heard is taken.
+    """
+
+    def __init__(self, system: int, component: int, adopts: bool) -> None:
+        self.system = system
+        self.component = component
+        self._armed_us: int | None = None  # when the autopilot last said that it is
+        self._undecided = adopts
+        self._heard: set[int] = set()  # systems with an autopilot
+        self._first_us = 0
+
+    @property
+    def own(self) -> tuple[int, int]:
+        """System and component id."""
+        return self.system, self.component
+
+    def is_armed(self, now_us: int) -> bool:
+        """Whether our vehicle is, as its autopilot said of late."""
+        return self._armed_us is not None and 0 <= now_us - self._armed_us < ARMED_FOR_US
+
+    def hear(self, frame: Frame, received_us: int) -> bool:
+        """Take a frame that may be an autopilot's HEARTBEAT; whether our system id has changed."""
+        if frame.message_id != IDS["HEARTBEAT"] or (frame.system, frame.component) == self.own:
+            return False
+        vehicle_type, autopilot, base_mode = _HEARTBEAT(frame.payload)
+        if autopilot == NO_AUTOPILOT or vehicle_type == GROUND_STATION or not frame.system:
+            return False
+        if frame.system == self.system:
+            self._armed_us = received_us if base_mode & ARMED else None
+        return self._undecided and self._decide(frame.system, received_us)
+
+    def _decide(self, system: int, received_us: int) -> bool:
+        if not self._heard:
+            self._first_us = received_us
+        self._heard.add(system)
+        if 0 <= received_us - self._first_us < WINDOW_US:
+            return False
+        self._undecided = False
+        before = self.system
+        if len(self._heard) == 1:
+            self.system = system
+        return self.system != before

@@ -1,0 +1,87 @@
+"""Who listens to us, and what each of them gets: rates and sequence numbers of its own."""
+
+from collections.abc import Iterable, Mapping
+from typing import get_args
+
+from risaf_link.mavlink.commands import Peer
+from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.pulse import HEARTBEAT_US
+from risaf_link.mavlink.telemetry import Emitter, Message, Rates
+
+MOST_PEERS = 256  # that are remembered
+FASTEST_US = 100.0  # shortest interval of a message: the array's rate is less anyway
+LARGEST_INTERVAL_US = 2**31 - 1
+
+EMITTED: dict[int, Message] = {IDS[name]: name for name in get_args(Message)}
+"""Messages that may be asked for, by their ids."""
+
+
+class Peers:
+    """The emitters of all peers.
+
+    Parameters
+    ----------
+    system, component : int
+        Whom the frames come from.
+    rates : dict
+        Of links without rates of their own.
+    by_link : mapping
+        Link's name to its own rates.
+    """
+
+    def __init__(
+        self, system: int, component: int, rates: Rates, by_link: Mapping[str, Rates]
+    ) -> None:
+        self._own = system, component
+        self._rates = rates
+        self._by_link = by_link
+        self._emitters: dict[Peer, Emitter] = {}
+
+    def emitter(self, peer: Peer) -> Emitter:
+        """The one that makes the frames for a peer."""
+        emitter = self._emitters.get(peer)
+        if emitter is None:
+            emitter = Emitter(self._by_link.get(peer[0], self._rates), *self._own)
+            self._emitters[peer] = emitter
+            if len(self._emitters) > MOST_PEERS:
+                del self._emitters[next(iter(self._emitters))]
+        return emitter
+
+    def listening(self, peers: Iterable[Peer]) -> list[Peer]:
+        """Those that get anything: what is for all is for them."""
+        return [peer for peer in peers if self.emitter(peer).rates]
+
+    def known(self) -> list[Peer]:
+        """All that were ever sent anything, and get something."""
+        return self.listening(list(self._emitters))
+
+    def set_defaults(self, rates: Rates) -> None:
+        """Change the rates of links without rates of their own."""
+        self._rates = rates
+        for (link, _), emitter in self._emitters.items():
+            emitter.set_defaults(self._by_link.get(link, rates))
+
+    def rename(self, system: int) -> None:
+        """Speak under another system id from now on."""
+        self._own = system, self._own[1]
+        for emitter in self._emitters.values():
+            emitter.system = system
+
+    def ask(self, peer: Peer, message_id: int, interval_us: float) -> bool:
+        """Let a peer have a message so often, -1 not at all, 0 by default; whether that can be."""
+        name = EMITTED.get(message_id)
+        sensible = interval_us in {-1.0, 0.0} or 0 < interval_us <= LARGEST_INTERVAL_US
+        if name is None or not sensible:
+            return False
+        rate = 0.0 if interval_us < 0 else 1e6 / max(interval_us, FASTEST_US)
+        self.emitter(peer).ask(name, rate if interval_us else None)
+        return True
+
+    def interval_us(self, peer: Peer, message_id: int) -> int:
+        """How often a peer gets a message, as MESSAGE_INTERVAL says it."""
+        if message_id == IDS["HEARTBEAT"]:
+            return HEARTBEAT_US
+        if message_id not in EMITTED:
+            return 0
+        rate = self.emitter(peer).rates.get(EMITTED[message_id], 0.0)
+        return min(max(round(1e6 / rate), 1), LARGEST_INTERVAL_US) if rate else -1
