@@ -1,10 +1,10 @@
 """A component on a network of ground stations that pymavlink speaks for."""
 
 from collections import defaultdict
+from importlib.util import find_spec, module_from_spec
 from typing import Any
 
 import msgspec
-from pymavlink.dialects.v20 import all as public
 from wire import frame
 
 from risaf_link.config import Config
@@ -18,7 +18,18 @@ from risaf_link.mavlink.parameters import Parameters
 OWN = (1, 191)
 GCS, OTHER_GCS = (255, 190), (254, 190)
 NEAR, FAR = ("ground", "10.0.0.2:14550"), ("ground", "10.0.0.3:14550")
-public.mavlink_map.update(risaf.mavlink_map)  # one decoder for all
+
+
+def _decoder_of_all() -> Any:
+    """Make a copy of pymavlink's dialect of all public messages, with ours beside them."""
+    spec = find_spec("pymavlink.dialects.v20.all")
+    dialect = module_from_spec(spec)
+    spec.loader.exec_module(dialect)
+    dialect.mavlink_map.update(risaf.mavlink_map)
+    return dialect
+
+
+public = _decoder_of_all()
 
 
 class Recorder:

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from risaf_link.core.aiding import Aiding, SpeedTracker
 from risaf_link.core.earth import GRAVITY
-from risaf_link.core.eskf import Eskf, Gravity
+from risaf_link.core.eskf import BIAS, Eskf, Gravity
 from risaf_link.core.rotation import matrix_from_quaternion, quaternion_from_euler, wrap
 
 pytestmark = pytest.mark.usefixtures("filter_form")
@@ -94,6 +94,28 @@ def test_a_long_curve_at_a_speed_that_nobody_tells_is_no_tilt(speed, rate):
     state = estimator.state(0)
     assert worst < 1.0
     assert worst < 2.0 * math.degrees(math.hypot(state.roll_std, state.pitch_std))
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.5])
+def test_a_start_at_speed_in_a_curve_leaves_tilt_and_bias_within_what_is_claimed(noise):
+    """Switched on at 15 m/s: the first gravity leans by 13 deg, and nothing is known yet."""
+    generator = np.random.default_rng(3)
+    estimator, aiding = Eskf(DEFAULTS), Aiding()
+    rate_b, force_b = np.array([0.0, 0.0, 0.15]), np.array([0.0, 15.0 * 0.15, -GRAVITY])
+    yaw, level = 0.0, quaternion_from_euler(0.0, 0.0, 0.0)
+    for step in range(1, 3000):
+        yaw += 0.15 * DT
+        reading = fused(rate_b + 1e-3 * generator.normal(size=3))
+        estimator.predict(reading, DT)
+        aiding.take(estimator, reading, force_b + noise * generator.normal(size=3), DT)
+        if step % 20 == 0:
+            aiding.speed.hear(15.0 + 0.1 * generator.normal(), 0.1**2, 0.0)
+            estimator.correct_heading(wrap(yaw + 0.01 * generator.normal()), 0.01**2, 0.0, GATE)
+        if step % 100 == 0:
+            state, variance = estimator.state(0), estimator.covariance.diagonal()
+            tilt_std = math.degrees(math.hypot(state.roll_std, state.pitch_std))
+            assert tilt_error(estimator, level) < min(3.0 * tilt_std, 5.0)
+            assert (state.bias_b**2 < 9.0 * variance[BIAS]).all()
 
 
 def still_readings(bias, seconds, generator):

@@ -160,9 +160,11 @@ def test_a_bias_that_is_told_is_believed_whatever_it_was_held_to_be(filter_name)
     rate = np.array([0.03, -0.04, 0.05])
     rates = rate + np.random.default_rng(1).normal(0, 1e-4, (101, 9, 3))
     forces = np.zeros((101, 0, 3))
-    before = estimator.advance(np.full(100, 0.01), rates[:100], forces[:100]).attitude(-1, 0)
+    track, _ = estimator.advance(np.full(100, 0.01), rates[:100], forces[:100])
+    before = track.attitude(-1, 0)
     estimator.set_bias(rate, np.full(3, 1e-8))
-    after = estimator.advance(np.full(1, 0.01), rates[100:], forces[100:]).attitude(0, 0)
+    track, _ = estimator.advance(np.full(1, 0.01), rates[100:], forces[100:])
+    after = track.attitude(0, 0)
     assert np.abs(before.bias_b).max() < 1e-2
     assert after.bias_b == pytest.approx(rate, abs=1e-4)
     assert np.abs(after.rate_b).max() < 2e-4

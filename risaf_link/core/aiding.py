@@ -25,6 +25,7 @@ from risaf_link.core.gear import STANDING_SPEED
 from risaf_link.core.rotation import Floats
 
 PART, PARTS = 0.1, 30  # s, and their number in a mean of specific force
+SHORTEST_SPAN = PART * PARTS / 4.0  # s, from one mean to the next but for the first: half of it
 HEAVES = 2.0  # standard deviations of the size that are no level acceleration
 FLOOR = 0.01  # m/s^2, of a mean: rounding, nonlinearity
 HIDDEN_TIME = 1.0  # s for which one lasts that drives it
@@ -204,7 +205,7 @@ class GravityFinder:
         self._last = means_i[:, 0]
         hidden = size**2 - GRAVITY**2  # what a level acceleration adds
         doubt = 2.0 * GRAVITY * HEAVES * math.sqrt(size_variance + max(self._heaving, heave))
-        lasting = max(2.0 * HIDDEN_TIME / span, 1.0)
+        lasting = max(2.0 * HIDDEN_TIME / max(span, SHORTEST_SPAN), 1.0)
         turning = float(parts[:, 75] @ parts[:, 75] / (times @ times))
         along = across = max(hidden - doubt, 0.0)
         if not speed.known:

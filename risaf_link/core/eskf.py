@@ -334,7 +334,7 @@ class Eskf:
         return Correction(error, spread, gate, True, "heading", Outcome.RESET)
 
     def correct_gravity(self, gravity: Gravity) -> tuple[Correction, ...]:
-        """Fuse the direction of gravity; the first one sets the tilt.
+        """Fuse the direction of gravity; the first one sets the tilt if it knows better.
 
         The rotation from the vertical that the accelerometers show to the filter's own is measured
         about the vehicle's heading and across it: two scalars, fused if both are within the gate.
@@ -354,7 +354,9 @@ class Eskf:
         scale = 1.0 / size**2
         variances = [gravity.right * scale, gravity.forward * scale]
         if not self._levelled:
-            return self._level(about_n, gravity, variances)
+            if self._sets_tilt(about_n, variances):
+                return self._level(about_n, gravity, variances)
+            self._levelled = True
         rows = _level_rows(quaternion.yaw(self._attitude), gravity, size)
         errors = [float(row[0] * about_n[0] + row[1] * about_n[1]) for row in rows]
         corrections = self._fuse_all("gravity", rows, errors, variances, gate)
@@ -492,6 +494,12 @@ class Eskf:
             level = (EARTH_RATE * math.cos(self._latitude)) ** 2
             matrix_nb = self.matrix
             self._covariance[BIAS, BIAS] += level * (matrix_nb.T * [1.0, 1.0, 0.0]) @ matrix_nb
+
+    def _sets_tilt(self, about_n: tuple[float, float], variances: Sequence[float]) -> bool:
+        """Whether the first gravity says more than what was known beforehand, or contradicts it."""
+        known, gate = self._covariance.diagonal()[LEVEL], self._parameters.gate
+        surprising = np.square(about_n) > gate**2 * (known + max(variances))
+        return bool(max(variances) < known.min() or surprising.any())
 
     def _level(
         self, about_n: tuple[float, float], gravity: Gravity, variances: Sequence[float]

@@ -201,7 +201,8 @@ class GravityFinder {
     const double hidden = size_square - c.GRAVITY * c.GRAVITY;
     const double doubt =
         2.0 * c.GRAVITY * c.HEAVES * std::sqrt(size_variance + std::max(heaving_, heave));
-    const double span = time / 2.0, lasting = std::max(2.0 * c.HIDDEN_TIME / span, 1.0);
+    const double span = time / 2.0;
+    const double lasting = std::max(2.0 * c.HIDDEN_TIME / std::max(span, c.SHORTEST_SPAN), 1.0);
     double along = std::max(hidden - doubt, 0.0), across = along;
     if (!speed.known()) {
       const double curve = lasting_turn();

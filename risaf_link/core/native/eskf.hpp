@@ -29,7 +29,7 @@ using State = std::array<double, STATES>;
   X(offset_std) X(delay_std)                                                                      \
   X(LONG_STEP) X(UNKNOWN_RATE) X(LARGEST_RATE) X(LARGEST_FORCE) X(LARGEST_STEP) X(LARGEST_GAP)    \
   X(OFFSET_TIME) X(LATE_TIME) X(RATE_SPAN) X(STEEP) X(EARTH_RATE) X(GRAVITY)                      \
-  X(PART) X(HEAVES) X(FLOOR) X(HIDDEN_TIME) X(ANY_SPEED) X(SPEED_TIME) X(ACCELERATION_STD)        \
+  X(PART) X(SHORTEST_SPAN) X(HEAVES) X(FLOOR) X(HIDDEN_TIME) X(ANY_SPEED) X(SPEED_TIME) X(ACCELERATION_STD)        \
   X(ACCELERATION_TIME) X(SPEED_LOST) X(SPEED_JUMP) X(BLOCK) X(STILL) X(STILL_ALONE)               \
   X(STILL_ON_ROAD) X(STILL_BY_GRAVITY) X(CLAIMED_TURN) X(LEVEL_PART) X(LEVEL_TIME) X(TILTED_TIME) \
   X(UNFELT) X(REST_RATE) X(UNCONFIRMED_RATE) X(STANDING_SPEED)
@@ -295,7 +295,10 @@ class Eskf {
     const double scale = 1.0 / (size * size);
     const std::array<double, 2> variances{gravity.right * scale, gravity.forward * scale};
     if (!levelled_) {
-      return set_level(about_n, gravity, variances);
+      if (sets_tilt(about_n, std::max(variances[0], variances[1]))) {
+        return set_level(about_n, gravity, variances);
+      }
+      levelled_ = true;
     }
     const auto rows = level_rows(yaw(attitude()), gravity, size);
     const std::array<double, 2> errors{rows[0][0] * about_n[0] + rows[0][1] * about_n[1],
@@ -511,6 +514,12 @@ class Eskf {
             level * level * (matrix_nb[0][i] * matrix_nb[0][j] + matrix_nb[1][i] * matrix_nb[1][j]);
       }
     }
+  }
+
+  bool sets_tilt(const std::array<double, 2>& about_n, double variance) const {
+    const double x = covariance_[0][0], y = covariance_[1][1], gate = c.gate * c.gate;
+    return variance < std::min(x, y) || about_n[0] * about_n[0] > gate * (x + variance) ||
+           about_n[1] * about_n[1] > gate * (y + variance);
   }
 
   Corrections set_level(const std::array<double, 2>& about_n, const Gravity& gravity,
