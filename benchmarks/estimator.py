@@ -1,12 +1,15 @@
 """How true and how honest the estimate is: scenarios, seeds, faults and methods in one table.
 
     python benchmarks/estimator.py drive2 --seeds 10 --methods robust risaf median mean
+    python benchmarks/estimator.py drive2 --seeds 10 --methods robust oracle
     python benchmarks/estimator.py ekf2 --seeds 10 --set heading.delay=0
 
 Every run is a whole simulation, its frames through the service's own pipeline; all methods are
-given the same frames. A row is one method over all seeds: RMS of the heading's error in the outage,
-or of the whole run where there is none; RMS of error over stated standard deviation of each angle
-over the whole run; and the mean normalised innovation squared of the headings that were fused.
+given the same frames. `oracle` is `robust` told which sensors the faults hit, and without these
+from the first sample on: nobody who leaves out faulty sensors can know more. A row is one method
+over all seeds: RMS of the heading's error in the outage, or of the whole run where there is none;
+RMS of error over stated standard deviation of each angle over the whole run; and the mean
+normalised innovation squared of the headings that were fused.
 """
 
 import argparse
@@ -16,6 +19,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from risaf_link.config import load
 from risaf_link.core.estimate import EstimateBlock
@@ -23,14 +27,15 @@ from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.rotation import euler_from_quaternion, eulers_of, wraps
 from risaf_link.core.track import Track
 from risaf_link.mavlink.block import BlockReader
-from risaf_link.mavlink.frame import FrameTable
+from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.tlog import Stamps, TlogReader, record
 from risaf_link.mavlink.truth import truth_of
 from risaf_link.pipeline import Pipeline
-from risaf_link.sim.scenario import BOOT_US, scenario
+from risaf_link.sim.scenario import BOOT_US, Scenario, scenario
 from risaf_link.sim.stream import frames, record_time_us
 
-METHODS = ("robust", "risaf", "median", "mean")
+METHODS = ("robust", "risaf", "median", "mean", "oracle")
+HIT = math.radians(0.5)  # rad/s by which a fault changes a reading at least once
 Row = tuple[float, float, float, float, float]  # rmse and tilt, deg; error over sigma; NIS
 Tables = Sequence[tuple[FrameTable, Stamps]]
 
@@ -41,27 +46,62 @@ def run(
     """Run one seed with one choice of faults through every method."""
     seed, faults = case
     chosen = scenario(name, seed, faults=faults.split(","))
-    log = [record(record_time_us(time_us), raw) for time_us, raw in frames(chosen)]
-    tables = list(TlogReader([b"".join(log)]).tables())
+    tables = _tables(chosen)
     truths = dict(_truths(tables))
     outages = chosen.outages or ((0.0, math.inf),)
     rows = {}
     for method in methods:
-        config = load(None, [f"fusion.method={method}", *settings])
-        blocks = list(_blocks(Pipeline(config, config.own), tables))
+        known = None
+        if method == "oracle":
+            known = _hit(tables, _tables(scenario(name, seed, faults=["none"])))
+        fusion = "robust" if method == "oracle" else method
+        config = load(None, [f"fusion.method={fusion}", *settings])
+        blocks = list(_blocks(Pipeline(config, config.own), tables, known))
         rows[method] = _score(blocks, truths, outages[-1])
     return rows
 
 
-def _blocks(pipeline: Pipeline, tables: Tables) -> Iterator[EstimateBlock]:
+def _tables(chosen: Scenario) -> Tables:
+    log = [record(record_time_us(time_us), raw) for time_us, raw in frames(chosen)]
+    return list(TlogReader([b"".join(log)]).tables())
+
+
+def _items(pipeline: Pipeline, tables: Tables) -> Iterator[EpochBlock | tuple[Frame, int]]:
     reader = BlockReader(pipeline.ingest, pipeline.assembler)
-    for table, times_us in tables:
-        for item in reader.read(table, times_us):
-            if isinstance(item, EpochBlock):
-                yield from pipeline.advance(item)
-            else:
-                yield from pipeline.gather(*item)
+    for parts in tables:
+        yield from reader.read(*parts)
+
+
+def _blocks(
+    pipeline: Pipeline, tables: Tables, without: NDArray[np.bool_] | None = None
+) -> Iterator[EstimateBlock]:
+    """Run a log; `without` some sensors, (n,)."""
+    for item in _items(pipeline, tables):
+        if isinstance(item, EpochBlock):
+            if without is not None:
+                item.rates_b[:, without] = np.nan
+            yield from pipeline.advance(item)
+        else:
+            yield from pipeline.gather(*item)
     yield from pipeline.flush(0)
+
+
+def _hit(tables: Tables, sound: Tables) -> NDArray[np.bool_]:
+    """Which sensors are hit by a fault, (n,): they read otherwise than without."""
+    readings = []
+    for each in (tables, sound):
+        config = load(None)
+        pipeline, epochs = Pipeline(config, config.own), {}
+        for item in _items(pipeline, each):
+            if isinstance(item, EpochBlock):
+                epochs |= dict(zip(item.time_us.tolist(), item.rates_b, strict=True))
+            else:
+                pipeline.gather(*item)
+        readings.append(epochs)
+    common = sorted(readings[0].keys() & readings[1].keys())
+    faulty, without = (np.array([epochs[time] for time in common]) for epochs in readings)
+    differs = ~(np.abs(faulty - without) < HIT)  # true for NaN
+    return np.logical_or.reduce(differs, axis=(0, 2))
 
 
 def _truths(tables: Tables) -> Iterator[tuple[int, tuple[float, float, float]]]:
