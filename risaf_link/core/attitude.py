@@ -6,7 +6,6 @@ here are theirs.
 """
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -24,11 +23,11 @@ from risaf_link.core.rotation import (
     yaw_of,
 )
 from risaf_link.core.tunable import Tunable
+from risaf_link.core.yaw_history import YawHistory
 
 ATTITUDE = slice(0, 4)  # q_nb (w, x, y, z)
 BIAS = slice(4, 7)  # bias of the fused rate, rad/s, body
 
-YAW_HISTORY = 4096  # epochs; four seconds at 1 kHz
 LONG_STEP = 1.0  # s that a rate is believed to have lasted
 UNSEEN_TURN = 0.5  # rad/s, standard deviation of a vehicle's turning that no rate tells of
 UNKNOWN_YAW = 0.5  # rad, standard deviation of a yaw that a heading sets instead of correcting it
@@ -138,10 +137,8 @@ class PaperFilter:
         self._covariance = np.diag(std**2)
         self._bias_walk = np.diag([0.0] * 4 + [p.bias_walk**2] * 3)  # a second
         self._resets = 0
-        self._elapsed = 0.0  # s
         self._waiting = 0.0  # s, for a rate
-        self._yaws: deque[tuple[float, float]] = deque(maxlen=YAW_HISTORY)  # without corrections
-        self._yaw_corrections = 0.0  # their sum
+        self._yaws = YawHistory()
 
     def configure(self, parameters: AttitudeParameters) -> None:
         """Take new parameters; the state stays, and with it what they say of the start."""
@@ -186,8 +183,7 @@ class PaperFilter:
         self._rate = rate
         variance = np.where(np.isnan(fused.variance), fused.noise, fused.variance)
         self._integrate(rate, np.nan_to_num(variance), dt)
-        self._elapsed += dt
-        self._yaws.append((self._elapsed, yaw_of(self._q) - self._yaw_corrections))
+        self._yaws.advance(dt, yaw_of(self._q))
 
     def correct_heading(
         self, heading: float, variance: float, age: float, gate: float
@@ -242,7 +238,7 @@ class PaperFilter:
         covariance[ATTITUDE, ATTITUDE] += variance * np.outer(by_yaw, by_yaw)
         self._covariance = _symmetric(covariance)
         self._q = turn @ self._q
-        self._yaw_corrections += error
+        self._yaws.correct(error)
         self._resets += 1
         return innovation
 
@@ -294,7 +290,7 @@ class PaperFilter:
         self._covariance = _symmetric(
             remaining @ self._covariance @ remaining.T + variance * np.outer(gain, gain)
         )
-        self._yaw_corrections += wrap(yaw_of(self._q) - before)
+        self._yaws.correct(wrap(yaw_of(self._q) - before))
 
     def _turn_variance(self) -> float:
         """Variance of the attitude's error about the down axis, rad^2."""
@@ -308,16 +304,8 @@ class PaperFilter:
         return roll, pitch, yaw
 
     def _yaw_before(self, age: float) -> float:
-        """Yaw of `age` seconds ago, interpolated; the oldest known where that is too long ago."""
-        time = self._elapsed - age
-        later = None
-        for earlier in reversed(self._yaws):
-            if earlier[0] <= time:
-                part = (time - earlier[0]) / (later[0] - earlier[0]) if later else 0.0
-                change = wrap(later[1] - earlier[1]) if later else 0.0
-                return earlier[1] + part * change + self._yaw_corrections
-            later = earlier
-        return later[1] + self._yaw_corrections if later else yaw_of(self._q)
+        yaw = self._yaws.before(age)
+        return yaw_of(self._q) if yaw is None else yaw
 
 
 def _normalised(q: Floats) -> tuple[Floats, Floats]:

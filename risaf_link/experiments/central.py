@@ -11,7 +11,6 @@ what the paper counts in its table I, with a matrix of 3 n by 3 n in O(n^3).
 """
 
 import math
-from collections import deque
 from typing import Literal
 
 import numpy as np
@@ -20,6 +19,7 @@ from risaf_link.core.attitude import UNKNOWN_YAW, AttitudeParameters, Innovation
 from risaf_link.core.fusion import Epoch, quantiles
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, wrap
+from risaf_link.core.yaw_history import YawHistory
 from risaf_link.experiments.method import ArrayModel, Estimate, Gps, HeadingGate
 from risaf_link.experiments.so3 import exp
 
@@ -33,7 +33,6 @@ NO_INFORMATION = 1e-9  # (rad/s)^-2; of an axis that no sensor measures
 RATE_WALK = 5.0  # rad/s/sqrt(s): on a rough road a vehicle's rate may change by 0.5 rad/s in 10 ms
 COMMON_BIAS = 5e-4  # rad/s, of all sensors together, beside the mean of their own: temperature
 RATE_STD = 1.0  # rad/s, before the first reading
-HISTORY = 4096  # epochs
 
 
 Form = Literal["compact", "direct"]
@@ -61,9 +60,7 @@ class Centralised:
         self.covariance = np.diag([tilt, tilt, math.pi**2, *[bias] * 3, *[RATE_STD**2] * 3])
         self._aligned = False
         self._resets = 0
-        self._elapsed = 0.0  # s
-        self._yaws: deque[tuple[float, float]] = deque(maxlen=HISTORY)  # without corrections
-        self._corrections = 0.0  # of yaw, their sum
+        self._yaws = YawHistory()
 
     def step(self, epoch: Epoch) -> None:
         """Carry the state on to an epoch: let the rate walk, measure it, turn by it."""
@@ -73,8 +70,7 @@ class Centralised:
         if epoch.dt > 0:
             self.turn(epoch.dt)
             self._headings.advance(epoch.dt)
-            self._elapsed += epoch.dt
-        self._yaws.append((self._elapsed, self.yaw - self._corrections))
+        self._yaws.advance(epoch.dt, self.yaw)
 
     def correct(self, gps: Gps) -> None:
         """Use a fix."""
@@ -134,7 +130,7 @@ class Centralised:
         """Fuse a heading, as `PaperFilter` does."""
         if not self._aligned or self.covariance[DOWN, DOWN] > UNKNOWN_YAW**2:
             return self.reset_heading(heading, variance, age, gate)
-        error = wrap(heading - self.yaw_before(age))
+        error = wrap(heading - self._yaw_before(age))
         row = self.heading_row()
         spread = float(row @ self.covariance @ row) + variance
         innovation = Innovation(error, spread, gate)
@@ -144,31 +140,23 @@ class Centralised:
             remaining = IDENTITY - np.outer(gain, row)
             covariance = remaining @ self.covariance @ remaining.T
             self.apply(gain * error, covariance + variance * np.outer(gain, gain))
-            self._corrections += wrap(self.yaw - before)
+            self._yaws.correct(wrap(self.yaw - before))
         return innovation
 
     def reset_heading(self, heading: float, variance: float, age: float, gate: float) -> Innovation:
         """Set yaw by a heading, whatever it was; its error is that of the heading alone."""
-        error = wrap(heading - self.yaw_before(age))
+        error = wrap(heading - self._yaw_before(age))
         innovation = Innovation(error, self.covariance[DOWN, DOWN] + variance, gate, reset=True)
         self.matrix_nb = exp(np.array([0.0, 0.0, error])) @ self.matrix_nb
         self.covariance[DOWN, :] = self.covariance[:, DOWN] = 0.0
         self.covariance[DOWN, DOWN] = variance
-        self._corrections += error
+        self._yaws.correct(error)
         self._aligned = True
         return innovation
 
-    def yaw_before(self, age: float) -> float:
-        """Yaw of `age` seconds ago, as known now."""
-        time = self._elapsed - age
-        later = None
-        for earlier in reversed(self._yaws):
-            if earlier[0] <= time:
-                part = (time - earlier[0]) / (later[0] - earlier[0]) if later else 0.0
-                change = wrap(later[1] - earlier[1]) if later else 0.0
-                return earlier[1] + part * change + self._corrections
-            later = earlier
-        return (later[1] if later else self.yaw) + self._corrections
+    def _yaw_before(self, age: float) -> float:
+        yaw = self._yaws.before(age)
+        return self.yaw if yaw is None else yaw
 
 
 def common_bias_std(array: ArrayModel) -> float:

@@ -1,7 +1,6 @@
 """The particle filter with a likelihood of maximum correntropy."""
 
 import math
-from collections import deque
 
 import numpy as np
 
@@ -9,12 +8,12 @@ from risaf_link.core.attitude import AttitudeParameters, Innovation
 from risaf_link.core.fusion import Epoch
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, wrap
+from risaf_link.core.yaw_history import YawHistory
 from risaf_link.experiments.central import common_bias_std, medians
 from risaf_link.experiments.method import ArrayModel, Estimate, Gps, HeadingGate
 from risaf_link.experiments.so3 import exp, exps
 
 SHRINK = 0.98  # Liu and West: (3 d - 1) / (2 d), for their discount d between 0.95 and 0.99
-HISTORY = 512  # epochs; half a second at 1 kHz
 
 
 class Particles:
@@ -54,8 +53,7 @@ class Particles:
         self._bias = draw[:, 3:] * common_bias_std(array)  # rad/s, body
         self._weights = np.full(count, 1.0 / count)
         self._aligned = False
-        self._elapsed = 0.0
-        self._yaws: deque[tuple[float, float]] = deque(maxlen=HISTORY)
+        self._yaws = YawHistory()  # of the middle
 
     def step(self, epoch: Epoch) -> None:
         """Carry the particles on to an epoch."""
@@ -63,8 +61,7 @@ class Particles:
         if epoch.dt > 0:
             self._turn(rate_b, epoch.dt)
             self._headings.advance(epoch.dt)
-            self._elapsed += epoch.dt
-        self._yaws.append((self._elapsed, self._middle))
+        self._yaws.advance(epoch.dt, self._middle)
 
     def fuse(self, rates_b: Floats) -> Floats:
         """Location of greatest correntropy of the readings, (n, 3), on each axis, rad/s."""
@@ -122,7 +119,7 @@ class Particles:
         """Set the yaw of all particles by a heading."""
         error = wrap(heading - self._middle_before(age))
         self._matrix_nb = exp(np.array([0.0, 0.0, error])) @ self._matrix_nb
-        self._yaws = deque([(t, yaw + error) for t, yaw in self._yaws], maxlen=HISTORY)
+        self._yaws.correct(error)
         count = len(self._weights)
         self._error[:, 2] = math.sqrt(variance) * self._random.standard_normal(count)
         self._aligned = True
@@ -142,9 +139,8 @@ class Particles:
         return math.atan2(self._matrix_nb[1, 0], self._matrix_nb[0, 0])
 
     def _middle_before(self, age: float) -> float:
-        time = self._elapsed - age
-        nearest = min(self._yaws, key=lambda known: abs(known[0] - time), default=None)
-        return nearest[1] if nearest else self._middle
+        yaw = self._yaws.before(age)
+        return self._middle if yaw is None else yaw
 
     def _yaw_errors(self) -> Floats:
         """Yaw of every particle against the middle, rad, (m,)."""
@@ -177,5 +173,4 @@ class Particles:
         before = self._middle
         self._matrix_nb = exp(mean) @ self._matrix_nb
         self._error = self._error - mean
-        moved = wrap(self._middle - before)
-        self._yaws = deque([(t, yaw + moved) for t, yaw in self._yaws], maxlen=HISTORY)
+        self._yaws.correct(wrap(self._middle - before))
