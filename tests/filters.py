@@ -7,7 +7,8 @@ import numpy as np
 from risaf_link.core import aiding, eskf, kernel, robust
 from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
-from risaf_link.core.eskf import Eskf, Gravity
+from risaf_link.core.error_state import Gravity
+from risaf_link.core.eskf import Eskf
 from risaf_link.core.fusion import FusedRate, FusionParameters
 from risaf_link.core.rotation import matrix_from_quaternion
 

@@ -22,7 +22,8 @@ from hypothesis import strategies as st
 
 from risaf_link.core.aiding import Aiding, SpeedTracker
 from risaf_link.core.earth import GRAVITY
-from risaf_link.core.eskf import BIAS, Eskf, Gravity
+from risaf_link.core.error_state import BIAS, Gravity
+from risaf_link.core.eskf import Eskf
 from risaf_link.core.rotation import matrix_from_quaternion, quaternion_from_euler, wrap
 
 pytestmark = pytest.mark.usefixtures("filter_form")

@@ -29,7 +29,8 @@ from msgspec.structs import replace as set_parameters
 
 from risaf_link.core.aiding import Aiding
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
-from risaf_link.core.eskf import ACCELEROMETER, ATTITUDE, STATES, Eskf, Gravity, Outcome, drive
+from risaf_link.core.error_state import ACCELEROMETER, ATTITUDE, STATES, Gravity, Outcome, drive
+from risaf_link.core.eskf import Eskf
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import (
     euler_from_quaternion,

@@ -10,7 +10,8 @@ from msgspec.structs import replace as set_parameters
 
 from risaf_link.core.attitude import AttitudeParameters, Innovation, PaperFilter
 from risaf_link.core.earth import GRAVITY, radii
-from risaf_link.core.eskf import LATE, Eskf, Gravity
+from risaf_link.core.error_state import LATE, Gravity
+from risaf_link.core.eskf import Eskf
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.guard import HeadingGuard, Whiteness
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingParameters

@@ -8,7 +8,8 @@ import pytest
 
 from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
-from risaf_link.core.eskf import ATTITUDE, BIAS, Eskf, Gravity, Outcome
+from risaf_link.core.error_state import ATTITUDE, BIAS, Gravity, Outcome
+from risaf_link.core.eskf import Eskf
 from risaf_link.core.fusion import Epoch, FusionParameters
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.robust import Robust

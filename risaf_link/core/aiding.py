@@ -8,18 +8,8 @@ import numpy as np
 
 from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
-from risaf_link.core.eskf import (
-    ACCELEROMETER,
-    GYRO,
-    LARGEST_FORCE,
-    LARGEST_GAP,
-    LARGEST_STEP,
-    LONG_STEP,
-    Correction,
-    Eskf,
-    Gravity,
-    drive,
-)
+from risaf_link.core.error_state import ACCELEROMETER, GYRO, Correction, Gravity, drive
+from risaf_link.core.eskf import LARGEST_FORCE, LARGEST_GAP, LARGEST_STEP, LONG_STEP, Eskf
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.gear import STANDING_SPEED
 from risaf_link.core.rotation import Floats

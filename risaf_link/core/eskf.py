@@ -23,32 +23,42 @@ turns show.
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from enum import IntEnum
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from risaf_link.core import quaternion
-from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation
+from risaf_link.core.attitude import AttitudeParameters, AttitudeState
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
+from risaf_link.core.error_state import (
+    ACCELEROMETER,
+    ATTITUDE,
+    BIAS,
+    BIAS_AXES,
+    DOWN,
+    GYRO,
+    HEADING,
+    HEADING_AXES,
+    IDENTITY,
+    LATE,
+    LEVEL,
+    OFFSET,
+    SCALE,
+    STATES,
+    STEEP,
+    Correction,
+    Gravity,
+    Outcome,
+    drive,
+    level_rows,
+    tilt_rows,
+    yaw_row,
+)
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.quaternion import Quaternion, Vector
 from risaf_link.core.rotation import Floats, wrap
-
-ATTITUDE = slice(0, 3)  # error: rotation vector, rad, NED
-BIAS = slice(3, 6)  # error of the fused rate's bias, rad/s, body
-SCALE = slice(6, 15)  # error of the matrix that the rate is too large by, row by row
-GYRO = slice(3, 15)  # both
-ACCELEROMETER = slice(15, 27)  # the same of the accelerometers: m/s^2, body; 9 of the matrix
-HEADING = slice(27, 29)  # what is wrong with the headings:
-OFFSET = 27  # rad, by which all of them are off: antennas, a crabbing vehicle
-LATE = 28  # s, by which they are later than told
-STATES = 29
-DOWN = 2
-LEVEL, BIAS_AXES, HEADING_AXES = np.arange(2), np.arange(3, 6), np.arange(27, 29)  # for diagonals
-IDENTITY = np.eye(STATES)
 
 HISTORY = 1024  # epochs; a second at 1 kHz
 LONG_STEP = 0.5  # s; over a longer one nothing is known of the rate
@@ -59,50 +69,8 @@ LARGEST_STEP = 3600.0  # s; afterwards nothing is known anyway
 LARGEST_GAP = 2.5  # s; what is further apart is not one run
 OFFSET_TIME, LATE_TIME = 300.0, 1000.0  # s, in which what is wrong with headings becomes another
 RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
-STEEP = 0.99  # sine of the pitch beyond which a heading says nothing of yaw: 82 deg
 
 USUAL_HEADING = HeadingParameters()
-
-
-class Outcome(IntEnum):
-    """What came of a measurement."""
-
-    FUSED = 0
-    RESET = 1
-    """The state was set by it."""
-    REJECTED = 2
-    """Beyond the gate."""
-    NOT_FINITE = 3
-    """NaN, infinite or of a size that nothing real has."""
-    UNOBSERVABLE = 4
-    """A heading while the vehicle points up or down."""
-
-
-@dataclass(frozen=True, slots=True)
-class Correction(Innovation):
-    """An innovation, and what came of it."""
-
-    source: str = ""
-    outcome: Outcome = Outcome.FUSED
-
-    @property
-    def fused(self) -> bool:
-        """Whether the measurement was used."""
-        return self.outcome in {Outcome.FUSED, Outcome.RESET}
-
-
-@dataclass(frozen=True, slots=True)
-class Gravity:
-    """What the accelerometers say of the vertical."""
-
-    gravity_n: Floats  # (3,) m/s^2, by the filter's attitude; (0, 0, g) if that is right
-    forward: float  # (m/s^2)^2, variance of its part along the vehicle's heading
-    right: float  # (m/s^2)^2, variance of its part across
-    down: float = math.inf  # (m/s^2)^2, of its size; infinite: not known
-    lever: Floats = field(default_factory=lambda: np.zeros((3, 12)))
-    """Integral of `drive` from the time of the measurement: what the gyro's errors turned since."""
-    by_errors: Floats = field(default_factory=lambda: np.zeros((3, 12)))
-    """What the accelerometers' errors make of it."""
 
 
 class Eskf:
@@ -357,7 +325,7 @@ class Eskf:
             if self._sets_tilt(about_n, variances):
                 return self._level(about_n, gravity, variances)
             self._levelled = True
-        rows = _level_rows(quaternion.yaw(self._attitude), gravity, size)
+        rows = level_rows(quaternion.yaw(self._attitude), gravity, size)
         errors = [float(row[0] * about_n[0] + row[1] * about_n[1]) for row in rows]
         corrections = self._fuse_all("gravity", rows, errors, variances, gate)
         patience = 0.0 if self.resting else self._parameters.gravity_distrust
@@ -400,7 +368,7 @@ class Eskf:
         """Read the estimate as of the last predict."""
         q_nb = self._attitude
         matrix_nb = quaternion.matrix(q_nb)
-        rows = np.array([*_tilt_rows(matrix_nb), _yaw_row(matrix_nb, self._rate, 0.0)[ATTITUDE]])
+        rows = np.array([*tilt_rows(matrix_nb), yaw_row(matrix_nb, self._rate, 0.0)[ATTITUDE]])
         variance = ((rows @ self._covariance[ATTITUDE, ATTITUDE]) * rows).sum(axis=1)
         roll, pitch, yaw = np.minimum(np.sqrt(variance), math.pi).tolist()
         return AttitudeState(
@@ -515,7 +483,7 @@ class Eskf:
         upright = replace(
             gravity, lever=turned @ gravity.lever, by_errors=turned @ gravity.by_errors
         )
-        for row in _level_rows(0.0, upright, GRAVITY):
+        for row in level_rows(0.0, upright, GRAVITY):
             self._gain(row, max(variances))
         self._levelled = True
         return tuple(
@@ -608,7 +576,7 @@ class Eskf:
         error = wrap(heading - float(self._wrong[0]) - yaw_then)
         if abs(matrix_then[2, 0]) > STEEP:
             return None, error
-        row = _yaw_row(matrix_then, self._rate, age)
+        row = yaw_row(matrix_then, self._rate, age)
         row[HEADING] = 1.0, -self._yaw_rate_before(age)
         return row, error
 
@@ -644,52 +612,3 @@ class Eskf:
 
 def _usable(heading: float, variance: float, age: float) -> bool:
     return math.isfinite(heading) and 0 < variance < math.inf and 0 <= age < math.inf
-
-
-def drive(matrix: Floats, reading_b: Floats) -> Floats:
-    """What the errors of a triad make of its reading in another frame, shape (3, 12).
-
-    A bias `b` and a matrix `M`, row by row, make the reading too large by `b + M reading`.
-    """
-    by_errors = np.empty((3, 12))
-    by_errors[:, 0:3] = matrix
-    by_errors[:, 3:] = (matrix[:, :, np.newaxis] * reading_b).reshape(3, 9)
-    return by_errors
-
-
-def _yaw_row(matrix_nb: Floats, rate_b: Floats, age: float) -> Floats:
-    """Yaw's derivative by the error, `age` after the attitude, shape (29,).
-
-    With the forward axis x: `d yaw = angle_D - x_D (x_N angle_N + x_E angle_E) / (x_N^2 + x_E^2)`;
-    the angle of then is that of now and what the gyro's errors have done since.
-    """
-    row = np.zeros(STATES)
-    row[DOWN] = 1.0
-    north, east, down = matrix_nb[:, 0].tolist()
-    level = max(north * north + east * east, 1.0 - STEEP**2)
-    row[0], row[1] = -down * north / level, -down * east / level
-    row[GYRO] = row[ATTITUDE] @ drive(matrix_nb, rate_b) * age
-    return row
-
-
-def _level_rows(yaw: float, gravity: Gravity, size: float) -> tuple[Floats, Floats]:
-    """Derivatives of what gravity shows about the heading and across it, shape (29,) each.
-
-    That is the angle at the time of the measurement, and what a bias of the accelerometers leans:
-    `angle_N - (R_nb bias)_E / g`, `angle_E + (R_nb bias)_N / g`.
-    """
-    about = np.zeros((2, STATES))
-    about[0, 0] = about[1, 1] = 1.0
-    about[:, GYRO] = gravity.lever[0:2]
-    about[0, ACCELEROMETER] = gravity.by_errors[1] / -size
-    about[1, ACCELEROMETER] = gravity.by_errors[0] / size
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    return cosine * about[0] + sine * about[1], cosine * about[1] - sine * about[0]
-
-
-def _tilt_rows(matrix_nb: Floats) -> tuple[Floats, Floats]:
-    """Derivatives of roll and pitch by the angles about north, east, down, shape (3,) each."""
-    north, east, _ = matrix_nb[:, 0].tolist()
-    level = max(north * north + east * east, 1e-12)
-    cosine = math.sqrt(level)
-    return np.array([north, east, 0.0]) / level, np.array([-east, north, 0.0]) / cosine

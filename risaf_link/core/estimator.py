@@ -14,7 +14,7 @@ from msgspec import structs
 from risaf_link.core import kernel
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState, Innovation, PaperFilter
 from risaf_link.core.earth import EARTH_RATE
-from risaf_link.core.eskf import BIAS_AXES
+from risaf_link.core.error_state import BIAS_AXES
 from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion

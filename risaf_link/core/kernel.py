@@ -11,7 +11,8 @@ from msgspec import structs
 
 from risaf_link.core import aiding, eskf, fusion, quaternion, robust
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState
-from risaf_link.core.eskf import USUAL_HEADING, Correction, Gravity, Outcome
+from risaf_link.core.error_state import Correction, Gravity, Outcome
+from risaf_link.core.eskf import USUAL_HEADING
 from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.health import SILENT_AFTER, ArrayHealth, judge_silence

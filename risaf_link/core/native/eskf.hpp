@@ -1,4 +1,4 @@
-// The filter of eskf.py, whose text says what is done and why; names are the same.
+// The filter of eskf.py and error_state.py, whose text says what is done and why; names are the same.
 #pragma once
 
 #include <algorithm>
@@ -668,7 +668,7 @@ class Eskf {
 
   double true_age(double told) const { return std::max(told + wrong_[1], 0.0); }
 
-  // `_yaw_row` of eskf.py.
+  // `yaw_row` of error_state.py.
   State by_yaw(const Matrix& matrix_nb, double age) const {
     State row{};
     row[DOWN] = 1.0;
