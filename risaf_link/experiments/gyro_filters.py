@@ -6,7 +6,7 @@ import numpy as np
 
 from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.estimator import Estimator
-from risaf_link.core.fusion import Epoch, FusionParameters
+from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import Floats, wrap
 from risaf_link.experiments.method import Aided, ArrayModel, Estimate, Gps, estimate_of, one_rate
@@ -27,21 +27,29 @@ class Service:
     def __init__(self, fusion: FusionParameters, attitude: AttitudeParameters) -> None:
         self._estimator = Estimator(fusion, attitude, HeadingParameters())
         self.fusion = self._estimator.fusion
+        self._waiting: list[Epoch] = []  # until somebody asks
         self._estimate = Estimate(math.nan, math.pi, 0.0)
 
     def step(self, epoch: Epoch) -> None:
         """Carry the estimate on to an epoch."""
-        readings = epoch.rates_b[np.newaxis], epoch.forces_b[np.newaxis]
-        track, _ = self._estimator.advance(np.array([epoch.dt]), *readings)
-        self._estimate = estimate_of(track)
+        self._waiting.append(epoch)
 
     def correct(self, gps: Gps) -> None:
         """Use a fix: its heading, speed and latitude."""
+        self._advance()
         self._estimator.correct(gps.motion, gps.latitude)
 
     def estimate(self) -> Estimate:
         """Say the heading as of the last epoch."""
+        self._advance()
         return self._estimate
+
+    def _advance(self) -> None:
+        epochs, self._waiting = self._waiting, []
+        if epochs:
+            block = EpochBlock.of([(epoch, 0) for epoch in epochs])
+            track, _ = self._estimator.advance(block.dt, block.rates_b, block.forces_b)
+            self._estimate = estimate_of(track)
 
 
 class Ours(Service):
