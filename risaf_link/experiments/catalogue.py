@@ -33,6 +33,7 @@ class Entry:
     make: Factory
     title: str
     direct: bool = False  # whether it has an update of 3 n by 3 n besides
+    slow: bool = False  # whether a step takes many times as long as ours
 
 
 METHODS: dict[str, Entry] = {
@@ -43,13 +44,22 @@ METHODS: dict[str, Entry] = {
     "single": Entry(SingleEkf, "single-sensor EKF"),
     "integration": Entry(Integration, "mean, integrated"),
     "virtual": Entry(Virtual, "augmented virtual filter"),
-    "centralised": Entry(Centralised, "centralised EKF", direct=True),
-    "huber": Entry(Huber, "Huber EKF", direct=True),
-    "mcc": Entry(Correntropy, "maximum correntropy EKF", direct=True),
-    "vb": Entry(Variational, "variational Bayesian EKF", direct=True),
-    "mmukf": Entry(Unscented, "robust M-M unscented", direct=True),
-    "particles": Entry(Particles, "correntropy particle filter"),
+    "centralised": Entry(Centralised, "centralised EKF", direct=True, slow=True),
+    "huber": Entry(Huber, "Huber EKF", direct=True, slow=True),
+    "mcc": Entry(Correntropy, "maximum correntropy EKF", direct=True, slow=True),
+    "vb": Entry(Variational, "variational Bayesian EKF", direct=True, slow=True),
+    "mmukf": Entry(Unscented, "robust M-M unscented", direct=True, slow=True),
+    "particles": Entry(Particles, "correntropy particle filter", slow=True),
 }
+
+SLOW_SEEDS = 5
+"""Of a drive, on which slow methods are run, so that the rest can be run on many."""
+
+
+def methods_on(seed: int, own: Mapping[str, str]) -> tuple[str, ...]:
+    """The methods that are run on a seed."""
+    names = (name for name, entry in METHODS.items() if not entry.slow or seed < SLOW_SEEDS)
+    return (*names, *own)
 
 
 def titles(own: Mapping[str, str]) -> dict[str, str]:

@@ -107,10 +107,11 @@ def spread(values: Iterable[float]) -> tuple[float, float, float]:
 
 
 def rmses(results: Sequence[Row], method: str, reference: str = "truth") -> list[float]:
-    """Heading RMSE, deg, of a method in all outages of all results; NaN without a heading."""
+    """Heading RMSE, deg, of a method in all outages of all its results; NaN without a heading."""
     return [
         outage[reference]["rmse_deg"] if outage[reference] else math.nan
         for result in results
+        if method in result["methods"]
         for outage in result["methods"][method]["outages"]
     ]
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from risaf_link.experiments.case import Case, scenario_of
-from risaf_link.experiments.catalogue import METHODS, titles
+from risaf_link.experiments.catalogue import METHODS, SLOW_SEEDS, methods_on, titles
 from risaf_link.experiments.drives import QUICK_SENSORS, SHOWN
 from risaf_link.experiments.figures import colour, figure, legend
 from risaf_link.experiments.report import Section, Setting, rmses, spread, write
@@ -28,7 +28,7 @@ def montecarlo(setting: Setting) -> Section:
         Case(
             "circle",
             seed,
-            names,
+            methods_on(seed, dict(setting.own)),
             (outage,),
             duration=duration,
             sensors=QUICK_SENSORS if setting.quick else None,
@@ -58,7 +58,8 @@ def montecarlo(setting: Setting) -> Section:
         "Monte Carlo over spikes (fig. 6)",
         f"The circle, {duration - outage[0]:.0f} s without GPS after {outage[0]:.0f} s with it, "
         f"{scenario_of(cases[0]).sensors} sensors; spikes of 30 deg/s to both sides, on all. "
-        f"Medians of {len(seeds)} seeds; bands are quartiles. The last column is by how much the "
+        f"Medians of {len(seeds)} seeds (slow methods: {min(len(seeds), SLOW_SEEDS)}); bands are "
+        "quartiles. The last column is by how much the "
         "worst median is above that without spikes.",
         "the standard EKF grows steadily with the probability, RISAF stays low; no numbers.",
         ["method", *(SPIKE_HEAD.format(p) for p in percent), "rises by, %"],
