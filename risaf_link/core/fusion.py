@@ -191,16 +191,24 @@ class Risaf:
             self._relative_bias = np.hstack([self._relative_bias[:, :n], new])
 
 
-class Mean:
-    """The plain mean of the valid readings, per axis."""
+class _Plain:
+    """A fusion that learns nothing of the sensors."""
 
     def __init__(self, parameters: FusionParameters) -> None:
         self._parameters = parameters
         self._silence = SilenceMonitor()
 
     def configure(self, parameters: FusionParameters) -> None:
-        """Take new parameters; what was learnt stays."""
+        """Take new parameters."""
         self._parameters = parameters
+
+    def health(self) -> ArrayHealth:
+        """Judge the sensors as of the last epoch, by their silence alone."""
+        return self._silence.health()
+
+
+class Mean(_Plain):
+    """The plain mean of the valid readings, per axis."""
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
@@ -208,21 +216,9 @@ class Mean:
         self._silence.watch(epoch.rates_b, epoch.dt)
         return _mean_of_active(self._parameters, epoch, rates, valid, valid)
 
-    def health(self) -> ArrayHealth:
-        """Judge the sensors as of the last epoch, by their silence alone."""
-        return self._silence.health()
 
-
-class Median:
+class Median(_Plain):
     """The median of the valid readings, per axis."""
-
-    def __init__(self, parameters: FusionParameters) -> None:
-        self._parameters = parameters
-        self._silence = SilenceMonitor()
-
-    def configure(self, parameters: FusionParameters) -> None:
-        """Take new parameters; what was learnt stays."""
-        self._parameters = parameters
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
@@ -233,10 +229,6 @@ class Median:
         count = valid.sum(axis=1)
         variance = np.where(count > 1, (MAD_TO_STD * deviation) ** 2, np.nan)
         return _fused(self._parameters, epoch, median, variance, count, valid)
-
-    def health(self) -> ArrayHealth:
-        """Judge the sensors as of the last epoch, by their silence alone."""
-        return self._silence.health()
 
 
 def quantiles(values: Floats, shares: tuple[float, ...]) -> Floats:

@@ -35,46 +35,51 @@ _SHARED = (
 )
 
 
-class _Mean:
-    """`fusion.Mean` in C++."""
+class _Fusion:
+    """What the fusions of the kernel have in common."""
 
-    def __init__(self, parameters: FusionParameters) -> None:
-        self.kernel = _kernel.Mean(parameters.gyro_noise, parameters.bias_walk)
+    kernel: Any
+
+    def fuse(self, epoch: Epoch) -> FusedRate:
+        """Fuse the next epoch; its number of sensors may differ from the one before."""
+        return self.fuse_readings(epoch.time_us, epoch.dt, epoch.rates_b)
+
+    def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> FusedRate:
+        """Fuse what sensors of one kind read at one instant, (n, 3)."""
+        values, active = np.empty((4, 3)), np.empty(3, np.int64)
+        valid = self.kernel.fuse(dt, readings, values, active)
+        rate, variance, noise, bias_walk = values
+        return FusedRate(time_us, rate, variance, active, valid, noise, bias_walk)
+
+
+class _Plain(_Fusion):
+    """One that learns nothing of the sensors."""
+
+    def configure(self, parameters: FusionParameters) -> None:
+        """Take new parameters."""
+        self.kernel.configure(parameters.gyro_noise, parameters.bias_walk)
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch, by their silence alone."""
         return judge_silence(self.kernel.silent_for())
 
-    def configure(self, parameters: FusionParameters) -> None:
-        """Take new parameters; what was learnt stays."""
-        self.kernel.configure(parameters.gyro_noise, parameters.bias_walk)
 
-    def fuse(self, epoch: Epoch) -> FusedRate:
-        """Fuse one epoch; the variance is that of one sensor, as in eq. 8."""
-        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
+class _Mean(_Plain):
+    """`fusion.Mean` in C++."""
+
+    def __init__(self, parameters: FusionParameters) -> None:
+        self.kernel = _kernel.Mean(parameters.gyro_noise, parameters.bias_walk)
 
 
-class _Median:
+class _Median(_Plain):
     """`fusion.Median` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
         p = parameters
         self.kernel = _kernel.Median(p.gyro_noise, p.bias_walk, MAD_TO_STD)
 
-    def health(self) -> ArrayHealth:
-        """Judge the sensors as of the last epoch, by their silence alone."""
-        return judge_silence(self.kernel.silent_for())
 
-    def configure(self, parameters: FusionParameters) -> None:
-        """Take new parameters; what was learnt stays."""
-        self.kernel.configure(parameters.gyro_noise, parameters.bias_walk)
-
-    def fuse(self, epoch: Epoch) -> FusedRate:
-        """Fuse one epoch; the variance is that of one sensor, by the median absolute deviation."""
-        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
-
-
-class _Risaf:
+class _Risaf(_Fusion):
     """`fusion.Risaf` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
@@ -87,18 +92,15 @@ class _Risaf:
     @property
     def relative_bias(self) -> Floats:
         """Relative bias of each sensor, shape (n, 3), rad/s, as of the last epoch."""
-        return self.kernel.relative_bias().T
+        bias: Floats = self.kernel.relative_bias().T
+        return bias
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch, by their silence alone."""
         return judge_silence(self.kernel.silent_for(), self.relative_bias)
 
-    def fuse(self, epoch: Epoch) -> FusedRate:
-        """Fuse the next epoch; the variance is eq. 8, that of one sensor of the active set."""
-        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
 
-
-class _Robust:
+class _Robust(_Fusion):
     """`robust.Robust` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
@@ -111,26 +113,11 @@ class _Robust:
     @property
     def relative_bias(self) -> Floats:
         """Relative bias of each sensor, shape (n, 3), rad/s."""
-        return self.kernel.health()[3]
+        return self.health().relative_bias
 
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch; of a sensor, its worst axis counts."""
         return ArrayHealth(*self.kernel.health())
-
-    def fuse(self, epoch: Epoch) -> FusedRate:
-        """Fuse the next epoch; its number of sensors may differ from the one before."""
-        return _fuse(self.kernel, epoch.time_us, epoch.dt, epoch.rates_b)
-
-    def fuse_readings(self, time_us: int, dt: float, readings: Floats) -> FusedRate:
-        """Fuse what sensors of one kind read at one instant, (n, 3)."""
-        return _fuse(self.kernel, time_us, dt, readings)
-
-
-def _fuse(kernel: "_kernel._Fusion", time_us: int, dt: float, readings: Floats) -> FusedRate:
-    values, active = np.empty((4, 3)), np.empty(3, np.int64)
-    valid = kernel.fuse(dt, readings, values, active)
-    rate, variance, noise, bias_walk = values
-    return FusedRate(time_us, rate, variance, active, valid, noise, bias_walk)
 
 
 _SOURCES = ("heading", "gravity", "size", "rest")
@@ -276,7 +263,7 @@ def advance(
     """
     if not (
         BUILT
-        and isinstance(gyros, _Mean | _Median | _Risaf | _Robust)
+        and isinstance(gyros, _Fusion)
         and isinstance(accelerometers, _Robust)
         and isinstance(attitude, _Eskf)
         and isinstance(aid, _Aiding)
