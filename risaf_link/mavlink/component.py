@@ -24,6 +24,7 @@ from risaf_link.mavlink.notices import Notice, Notices, Severity, statustexts
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.peers import EMITTED, Peers
 from risaf_link.mavlink.pulse import Pulse
+from risaf_link.mavlink.signing import KEY_SIZE, SETUP_SIGNING, LinkSigning, setup_in
 from risaf_link.mavlink.telemetry import Rates, heartbeat
 from risaf_link.mavlink.tuning import Answer, Tuning
 
@@ -35,7 +36,7 @@ ORDERS = frozenset(
     IDS[name]
     for name in (
         *("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT"),
-        *("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"),
+        *("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET", "SETUP_SIGNING"),
     )
 )
 """Messages that may change what we do."""
@@ -80,6 +81,8 @@ class Component:
         Link's name to how many PARAM_VALUE a second it takes at most.
     keep : callable or None
         Begins to store parameters, by name, whose end is told by `kept`; None: there is no place.
+    signing : mapping
+        Link's name to how it is signed. Frames that it rejects must not get here.
 
     Attributes
     ----------
@@ -96,13 +99,15 @@ class Component:
         rates: Mapping[str, Rates] | None = None,
         pace: Mapping[str, float] | None = None,
         keep: Callable[[dict[str, float]], None] | None = None,
+        signing: Mapping[str, LinkSigning] | None = None,
     ) -> None:
         self.trouble = ""
         self._parameters = parameters
         self._tuned = parameters.tuned
         self._estimator = estimator
         self._identity = identity
-        self._peers = Peers(*identity.own, parameters.tuned.emit, rates or {})
+        self._signing = signing or {}
+        self._peers = Peers(*identity.own, parameters.tuned.emit, rates or {}, self._signing)
         self._pace = dict(pace or {})
         self._keep = keep
         self._stored = dict(parameters.kept)
@@ -144,6 +149,8 @@ class Component:
             return
         if self._identity.hear(frame, received_us):
             self._adopt()
+        if frame.message_id == SETUP_SIGNING:
+            self._set_up_signing(frame, peer)
         order = order_in(frame, peer)
         if order:
             self._obey(order)
@@ -241,6 +248,19 @@ class Component:
         self._estimator.configure(self._tuned)
         if self._tuned.emit != before.emit:
             self._peers.set_defaults(self._tuned.emit)
+
+    def _set_up_signing(self, frame: Frame, peer: Peer) -> None:
+        """Take another key, if it is for us alone and the link is one that may set it."""
+        signing, setup = self._signing.get(peer[0]), setup_in(frame)
+        if signing is None or not signing.takes_setup or setup.to != self._identity.own:
+            return
+        if setup.secret == bytes(KEY_SIZE):
+            self._tell(Notice(Severity.WARNING, "signing key refused: it is all zero"))
+        elif self._identity.is_armed(self._received_us):
+            self._tell(Notice(Severity.WARNING, "signing key refused: the vehicle is armed"))
+        else:
+            signing.key.replace(setup.secret, setup.ticks)
+            self._tell(Notice(Severity.NOTICE, "signing key set"))
 
     # Commands
 

@@ -4,6 +4,7 @@ How a stream is cut into frames is said in `search`. The kernel does the same wh
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,16 @@ from numpy.typing import NDArray
 
 from risaf_link.mavlink import search
 from risaf_link.mavlink.dialect import CRC_EXTRA
-from risaf_link.mavlink.search import CHECKSUM, CUT, CUTS, HEADERS, MARK_V2, REASONS, SIGNATURE
+from risaf_link.mavlink.search import (
+    CHECKSUM,
+    CUT,
+    CUTS,
+    HEADERS,
+    MARK_V2,
+    REASONS,
+    SIGNATURE,
+    SIGNED,
+)
 
 if TYPE_CHECKING:
     from risaf_link.core import _kernel
@@ -157,8 +167,15 @@ def _frame(buffer: bytes, record: Any) -> Frame:
     )
 
 
-def encode(message_id: int, payload: bytes, sequence: int, system: int, component: int) -> bytes:
-    """Make a MAVLink 2 frame, not signed.
+def encode(
+    message_id: int,
+    payload: bytes,
+    sequence: int,
+    system: int,
+    component: int,
+    sign: Callable[[bytes], bytes] | None = None,
+) -> bytes:
+    """Make a MAVLink 2 frame.
 
     Parameters
     ----------
@@ -168,8 +185,11 @@ def encode(message_id: int, payload: bytes, sequence: int, system: int, componen
         At most 255 bytes; trailing zeros are cut here, the first byte always stays.
     sequence, system, component : int
         One byte each.
+    sign : callable or None
+        From the frame to its signature, 13 bytes; None: it is not signed.
     """
     payload = payload[:1] + payload[1:].rstrip(b"\0")
-    header = bytes((len(payload), 0, 0, sequence, system, component))
+    header = bytes((len(payload), SIGNED if sign else 0, 0, sequence, system, component))
     content = header + message_id.to_bytes(3, "little") + payload
-    return bytes((MARK_V2,)) + content + search.checksum_of(content, CRC_EXTRA[message_id])
+    frame = bytes((MARK_V2,)) + content + search.checksum_of(content, CRC_EXTRA[message_id])
+    return frame + sign(frame) if sign else frame

@@ -6,6 +6,7 @@ from typing import get_args
 from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.pulse import HEARTBEAT_US
+from risaf_link.mavlink.signing import LinkSigning
 from risaf_link.mavlink.telemetry import Emitter, Message, Rates
 
 MOST_PEERS = 256  # that are remembered
@@ -27,21 +28,30 @@ class Peers:
         Of links without rates of their own.
     by_link : mapping
         Link's name to its own rates.
+    signing : mapping
+        Link's name to how it is signed.
     """
 
     def __init__(
-        self, system: int, component: int, rates: Rates, by_link: Mapping[str, Rates]
+        self,
+        system: int,
+        component: int,
+        rates: Rates,
+        by_link: Mapping[str, Rates],
+        signing: Mapping[str, LinkSigning],
     ) -> None:
         self._own = system, component
         self._rates = rates
         self._by_link = by_link
+        self._signing = signing
         self._emitters: dict[Peer, Emitter] = {}
 
     def emitter(self, peer: Peer) -> Emitter:
         """The one that makes the frames for a peer."""
         emitter = self._emitters.get(peer)
         if emitter is None:
-            emitter = Emitter(self._by_link.get(peer[0], self._rates), *self._own)
+            rates = self._by_link.get(peer[0], self._rates)
+            emitter = Emitter(rates, *self._own, self._signing.get(peer[0]))
             self._emitters[peer] = emitter
             if len(self._emitters) > MOST_PEERS:
                 del self._emitters[next(iter(self._emitters))]

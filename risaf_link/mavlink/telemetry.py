@@ -14,6 +14,7 @@ from risaf_link.core.heading import HeadingSource
 from risaf_link.core.health import ArrayHealth, SensorState
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import encode
+from risaf_link.mavlink.signing import LinkSigning
 
 Message = Literal[
     "ATTITUDE_QUATERNION",
@@ -62,6 +63,8 @@ class Emitter:
         Message name to Hz; a rate above the array's means every epoch.
     system, component : int
         Whom the frames come from.
+    signing : LinkSigning or None
+        Of the link; None: frames are not signed.
 
     Attributes
     ----------
@@ -69,8 +72,11 @@ class Emitter:
         As given; it may be another later.
     """
 
-    def __init__(self, rates: Rates, system: int, component: int) -> None:
+    def __init__(
+        self, rates: Rates, system: int, component: int, signing: LinkSigning | None = None
+    ) -> None:
         self.system = system
+        self._signing = signing
         self._rates = rates
         self._asked: dict[Message, float] = {}  # Hz, 0: none
         self._sent = rates  # what is sent in fact
@@ -133,7 +139,8 @@ class Emitter:
 
     def frame(self, name: str, /, **fields: Any) -> bytes:
         """Any message, from us."""
-        frame = encode(*pack(name, **fields), self._sequence, self.system, self._component)
+        sign = self._signing.sign if self._signing else None
+        frame = encode(*pack(name, **fields), self._sequence, self.system, self._component, sign)
         self._sequence = (self._sequence + 1) % 256
         return frame
 
