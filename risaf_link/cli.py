@@ -373,9 +373,11 @@ def check_config(file: Path) -> None:
     risaf-link check-config config/risaf_link.yaml
     """
     from risaf_link.config import dump, load, load_calibration
+    from risaf_link.keys import open_keys
 
     config = load(file)
     load_calibration(config)
+    open_keys(config)
     click.echo(dump(config), nl=False)
 
 

@@ -18,6 +18,8 @@ from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.tunable import Tunable
 from risaf_link.errors import ConfigError, LinkError
 from risaf_link.links import open_link
+from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.signing import SigningParameters
 from risaf_link.mavlink.telemetry import DEFAULT_RATES, Rates
 from risaf_link.pipeline import PipelineParameters
 
@@ -35,11 +37,12 @@ class MavlinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """One link; `emit` None: the default set."""
+    """One link; `emit` None: the default set; `signing` None: nothing is signed or verified."""
 
     name: Annotated[str, Meta(min_length=1)]
     url: str
     emit: Rates | None = None
+    signing: SigningParameters | None = None
 
 
 class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
@@ -137,6 +140,19 @@ def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
             open_link(link.url, link.name, lambda: 0)
         except LinkError as error:
             raise ConfigError(f"{where}links.{i}.url: {error}") from None
+        if link.signing:
+            _check_signing(f"{where}links.{i}.signing", link)
+
+
+def _check_signing(where: str, link: LinkParameters) -> None:
+    if link.url.startswith("tlog:"):
+        raise ConfigError(f"{where}: found it of a recording, expected it of a link with peers")
+    named = link.signing.accept_unsigned if link.signing else ()
+    for k, name in enumerate(() if isinstance(named, bool) else named):
+        if name not in IDS:
+            raise ConfigError(
+                f"{where}.accept_unsigned.{k}: found {name!r}, expected a MAVLink message's name"
+            )
 
 
 class _StrictLoader(yaml.SafeLoader):

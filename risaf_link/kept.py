@@ -33,14 +33,8 @@ class KeptParameters:
         """Replace what is kept, all or nothing, also if power fails; why it failed, or nothing."""
         if self.path is None:
             return "no configuration file"
-        new = self.path.with_name(f"{self.path.name}.new")
         try:
-            with new.open("w") as file:
-                file.write(HEAD + yaml.safe_dump(values, sort_keys=False))
-                file.flush()
-                os.fsync(file.fileno())
-            new.replace(self.path)
-            _sync(self.path.parent)
+            replace_file(self.path, (HEAD + yaml.safe_dump(values, sort_keys=False)).encode())
         except OSError as error:
             return f"{self.path.name}: {error.strerror or error}"
         return ""
@@ -100,6 +94,26 @@ def chosen_by(settings: Iterable[str]) -> tuple[str, ...]:
         for parameter in parameters_of(Config)
         if any(f"{parameter.key}.".startswith(f"{key}.") for key in keys)
     )
+
+
+def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
+    """Replace a file, all or nothing, also if power fails; raises OSError.
+
+    Parameters
+    ----------
+    path : Path
+    content : bytes
+    mode : int
+        Who may read and write it, less what the process's umask takes off.
+    """
+    new = path.with_name(f"{path.name}.new")
+    new.unlink(missing_ok=True)  # who may read it would be as before
+    with open(new, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
+    _sync(path.parent)
 
 
 def _place(config: Config, config_path: Path | None) -> Path | None:

@@ -13,18 +13,21 @@ from typing import Any
 from risaf_link.config import Config, load_calibration
 from risaf_link.core.estimate import Estimate
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
+from risaf_link.keys import open_keys
 from risaf_link.links import Link, TlogLink, open_link
 from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.component import Component
-from risaf_link.mavlink.frame import FrameParser
+from risaf_link.mavlink.frame import Frame, FrameParser
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.parameters import Parameters
+from risaf_link.mavlink.signing import SETUP_SIGNING, Rejection
 from risaf_link.pipeline import Pipeline
 
 TICK_S = 0.1  # from one look at what is due by time to the next
 MOST_PEERS = 256  # of all links together
 PARAM_VALUE_BYTES = 37  # of a PARAM_VALUE frame
 PARAMETERS_SHARE = 0.4  # of a link, that a list of parameters takes at most
+TELL_REJECTED_S = 60.0  # from one line on rejected frames to the next
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +63,7 @@ class Service:
     Raises
     ------
     ConfigError
-        If the calibration cannot be used.
+        If the calibration or a signing key cannot be used.
     """
 
     def __init__(
@@ -75,6 +78,9 @@ class Service:
         self._clock_us = clock_us
         self._kept = kept
         self._storing: set[asyncio.Task[None]] = set()
+        self._keys = open_keys(config)
+        self._told_rejected: Counter[str] = Counter()
+        self._next_telling_s = 0.0
         self._component = Component(
             parameters,
             self.pipeline,
@@ -82,6 +88,7 @@ class Service:
             rates={link.name: link.emit for link in config.links if link.emit is not None},
             pace={link.name: _pace(link) for link in self.links},
             keep=self._keep if kept.path else None,
+            signing=self._keys.links,
         )
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
@@ -95,8 +102,21 @@ class Service:
         """Frames that were lost in parsing, by reason, from the peers that are remembered."""
         return sum((parser.dropped for parser in self._parsers.values()), Counter())
 
+    @property
+    def rejected(self) -> Counter[str]:
+        """Frames that were not taken for their signatures, by link and reason."""
+        return self._keys.rejected
+
     async def run(self) -> None:
-        """Run until cancelled."""
+        """Run until cancelled.
+
+        Raises
+        ------
+        ConfigError
+            If the state of a signing key cannot be stored.
+        """
+        self._keys.advance(self._clock_us())
+        self._keys.open()
         _log.info("started: %s", ", ".join(link.name for link in self.links) or "no links")
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -108,20 +128,30 @@ class Service:
                     for block in self.pipeline.flush(self._received_us):
                         self._send(list(block))
         finally:
+            self._keys.close()
             counts = self.pipeline.assembler.counts
             _log.info("ended: %d frames, %d epochs", self._frames, counts["epochs"])
 
     def _receive(self, link: Link, data: bytes, peer: str) -> None:
         """Take what came over a link, and send what comes of it."""
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
+        self._keys.advance(received_us)
+        signing = self._keys.links.get(link.name)
         for frame in self._parser(link.name, peer).receive_data(data):
+            if signing and not signing.accepts(frame):
+                continue
             self._frames += 1
-            for recording in self._recordings:
-                recording.record(received_us, frame.raw)
+            self._record(frame, received_us)
             self._component.receive(frame, (link.name, peer), received_us)
             self._send(self.pipeline.step(frame, received_us))
         self._hand_out(self._component.collect(self._peers()))
         self._tell_mismatch()
+
+    def _record(self, frame: Frame, received_us: int) -> None:
+        """Record what was taken, but for keys."""
+        if frame.message_id != SETUP_SIGNING:
+            for recording in self._recordings:
+                recording.record(received_us, frame.raw)
 
     def _send(self, estimates: list[Estimate]) -> None:
         peers = list(self._peers()) if estimates else []
@@ -144,9 +174,27 @@ class Service:
             self._component.kept(parameters, failure)
             self._hand_out(self._component.collect(self._peers()))
 
-        task = asyncio.create_task(store())
+        self._begin(store())
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
         self._storing.add(task)
         task.add_done_callback(self._storing.discard)
+
+    def _look_after_keys(self, now_s: float) -> None:
+        """Set their clocks, store what is due, and tell of rejected frames."""
+        self._keys.advance(self._clock_us())
+        if self._keys.is_due(now_s):
+            self._begin(self._keys.store())
+        rejected = self.rejected
+        if now_s >= self._next_telling_s and rejected != self._told_rejected:
+            self._next_telling_s = now_s + TELL_REJECTED_S
+            new = sorted((rejected - self._told_rejected).items())
+            self._told_rejected = rejected
+            counts = ", ".join(f"{reason} {count}" for reason, count in new)
+            only_again = all(reason.endswith(Rejection.REPLAYED) for reason, _ in new)
+            level = logging.INFO if only_again else logging.WARNING  # networks repeat and overtake
+            _log.log(level, "rejected for their signatures: %s", counts)
 
     def _parser(self, link: str, peer: str) -> FrameParser:
         parser = self._parsers.pop((link, peer), None) or FrameParser()
@@ -165,6 +213,7 @@ class Service:
         """Do what is due by time; HEARTBEAT follows the estimator's progress."""
         loop = asyncio.get_running_loop()
         while True:
+            self._look_after_keys(loop.time())
             self._component.advance(round(loop.time() * 1e6))
             self._hand_out(self._component.collect(self._peers()))
             await asyncio.sleep(TICK_S)

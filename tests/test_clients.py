@@ -6,15 +6,18 @@ import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from random import Random
 
 import pytest
 import yaml
+from streams import parsed
+from wire import frame
 
 from risaf_link.config import Config
+from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.parameters import parameters_of
 
 CLIENTS = Path(__file__).parent / "clients"
@@ -22,6 +25,18 @@ DEADLINE_S = 90
 SYSTEM = 3
 RISAF = [sys.executable, "-c", "from risaf_link.cli import main; main()"]
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
+KEY = bytes(range(32))
+UNSIGNED_SET = bytes(
+    frame(
+        "PARAM_SET",
+        (255, 190),
+        target_system=SYSTEM,
+        target_component=191,
+        param_id=b"FUS_GATE",
+        param_value=9.0,
+        param_type=9,
+    ).raw
+)
 
 
 def free_port() -> int:
@@ -33,12 +48,12 @@ def free_port() -> int:
 class Running:
     """The service and a simulated vehicle that feeds it, as processes of their own."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, **ground: object) -> None:
         array, self.port = free_port(), free_port()
         self.config = directory / "vehicle.yaml"
         links = [
             {"name": "array", "url": f"udpin://127.0.0.1:{array}", "emit": {}},
-            {"name": "ground", "url": f"udpin://127.0.0.1:{self.port}"},
+            {"name": "ground", "url": f"udpin://127.0.0.1:{self.port}", **ground},
         ]
         self.config.write_text(yaml.safe_dump({"links": links, "mavlink": {"system_id": SYSTEM}}))
         self.written = self.config.read_text()
@@ -53,14 +68,20 @@ class Running:
             )
         ]
 
+    def said_so_far(self) -> str:
+        return Path(self.log.name).read_text()
+
     def end(self) -> list[int]:
+        """End both; exit statuses, that of the service first."""
+        if self.log.closed:
+            return self._status
         for process in self._processes:
             process.terminate()
-        status = [process.wait(DEADLINE_S) for process in self._processes]
+        self._status = [process.wait(DEADLINE_S) for process in self._processes]
         self.log.seek(0)
         self.said = self.log.read()
         self.log.close()
-        return status
+        return self._status
 
 
 @pytest.fixture
@@ -155,6 +176,47 @@ async def test_a_ground_station_on_a_bad_link(service):
     async with bad_link(service) as link:
         found = await client("ground_station.py", f"udpout:127.0.0.1:{link.port}", 10)
     assert_served(found, 10)
+
+
+@pytest.fixture
+def signed_service(tmp_path) -> Iterator[Running]:
+    key = tmp_path / "signing.key"
+    key.touch(0o600)
+    key.write_text(f"{KEY.hex()}\n")
+    running = Running(tmp_path, signing={"key": str(key)})
+    yield running
+    service, _ = running.end()
+    assert service == 0
+    assert KEY.hex() not in running.said
+
+
+async def test_a_ground_station_that_signs_and_one_that_does_not(signed_service):
+    port = signed_service.port
+    found = await client("ground_station.py", f"udpout:127.0.0.1:{port}", 10, KEY.hex())
+    assert_served(found, 10)
+    assert found["signed"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(UNSIGNED_SET, ("127.0.0.1", port))
+        async with asyncio.timeout(DEADLINE_S):
+            while "signatures: ground: unsigned 1" not in signed_service.said_so_far():
+                await asyncio.sleep(0.05)
+        stranger.setblocking(False)
+        heard = parsed(everything(stranger))[0]
+    assert IDS["PARAM_VALUE"] not in {each.message_id for each in heard}
+
+
+def everything(received: socket.socket) -> Iterator[bytes]:
+    """What a socket has received so far."""
+    with suppress(BlockingIOError):
+        while True:
+            yield received.recv(2048)
+
+
+async def test_a_ground_station_that_signs_on_a_bad_link(signed_service):
+    async with bad_link(signed_service) as link:
+        found = await client("ground_station.py", f"udpout:127.0.0.1:{link.port}", 10, KEY.hex())
+    assert_served(found, 10)
+    assert found["signed"]
 
 
 @pytest.mark.skipif(not find_spec("mavsdk"), reason="mavsdk is not installed")

@@ -14,6 +14,7 @@ LAYERS = [
     {"links", "publish", "sim"},
     {"config", "sweep"},
     {"kept"},
+    {"keys"},
     {"service", "replay", "survey", "calibrate", "experiments"},
     {"fleet", "words"},
     {"cli"},

@@ -1,7 +1,8 @@
 """A ground station by pymavlink's mavutil, as a process of its own.
 
-    ground_station.py URL RATE_HZ
+    ground_station.py URL RATE_HZ [KEY]
 
+With a key, 64 hexadecimal digits, it signs what it sends and takes nothing that is not signed.
 Waits for the component and asks it for everything; what came of it goes to standard output as JSON.
 Whatever is not answered is asked again, as on a link that loses frames.
 """
@@ -25,9 +26,11 @@ QUATERNION, UNKNOWN_MESSAGE, UNKNOWN_COMMAND = 31, 24, 400
 class Station:
     """Asks until it is answered, or the time is over."""
 
-    def __init__(self, url):
+    def __init__(self, url, key=""):
         self.link = mavutil.mavlink_connection(url, source_system=255, source_component=190)
         self.link.target_component = COMPONENT
+        if key:
+            self.link.setup_signing(bytes.fromhex(key), sign_outgoing=True)
         self._deadline = time.monotonic() + DEADLINE_S
         self._beaten = 0.0
         self.texts = []
@@ -43,7 +46,9 @@ class Station:
                 self.link.mav.heartbeat_send(6, 8, 0, 0, 4)
             self.link.select(0.05)
             message = self.link.recv_msg()
-            if message is None or message.get_srcComponent() != COMPONENT:
+            if message is None or message.get_type() == "BAD_DATA":
+                continue
+            if message.get_srcComponent() != COMPONENT:
                 continue
             if message.get_type() == "STATUSTEXT":
                 self.texts.append(message.text)
@@ -114,12 +119,13 @@ class Station:
 
 def main():
     url, rate = sys.argv[1], float(sys.argv[2])
-    station = Station(url)
+    station = Station(url, *sys.argv[3:])
     heartbeat = station.wait()
     print(
         json.dumps(
             {
                 "heartbeat": heartbeat.to_dict(),
+                "signed": heartbeat.get_signed(),
                 "interval": station.command(511, QUATERNION, 1e6 / rate),
                 "told_interval": station.request(244, "MESSAGE_INTERVAL", QUATERNION).interval_us,
                 "parameters": station.all_parameters(),

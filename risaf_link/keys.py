@@ -1,0 +1,224 @@
+"""Signing keys and what must outlast a restart, in files that nobody else may read.
+
+A key file holds 32 bytes, as they are or as 64 hexadecimal digits. Beside it lies NAME.state, the
+clock and the streams of that key. Both are replaced whole or not at all.
+"""
+
+import asyncio
+import logging
+import os
+import stat
+import threading
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+
+from risaf_link.config import Config
+from risaf_link.errors import ConfigError
+from risaf_link.kept import replace_file
+from risaf_link.mavlink.signing import KEY_SIZE, KeySnapshot, LinkSigning, SigningKey, SigningState
+
+PRIVATE = 0o600
+AGAIN_S = 5.0  # after what could not be stored; half of the clocks' reserve is 15 s
+OTHERS = stat.S_IRWXG | stat.S_IRWXO
+EXPECTED = f"{KEY_SIZE} bytes or {2 * KEY_SIZE} hexadecimal digits, not all zero"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class KeyFile:
+    """One key and where it is kept.
+
+    Attributes
+    ----------
+    path : Path
+    key : SigningKey
+    """
+
+    path: Path
+    key: SigningKey
+    _writing: threading.Lock = field(default_factory=threading.Lock)
+
+    def write(self, snapshot: KeySnapshot) -> str:
+        """Write what is to be stored; why that failed, or nothing. A thread may do it."""
+        files = [(state_path(self.path), msgspec.json.encode(snapshot.state))]
+        if snapshot.secret:
+            files.insert(0, (self.path, f"{snapshot.secret.hex()}\n".encode()))
+        with self._writing:
+            for path, content in files:
+                try:
+                    replace_file(path, content, PRIVATE)
+                except OSError as error:
+                    return f"{path}: {error.strerror or error}"
+        return ""
+
+
+class Keys:
+    """All keys of a configuration, and the links that are signed with them.
+
+    Parameters
+    ----------
+    files : iterable of KeyFile
+    links : dict
+        Link's name to how it is signed.
+
+    Attributes
+    ----------
+    links : dict
+        As given.
+    """
+
+    def __init__(self, files: Iterable[KeyFile], links: dict[str, LinkSigning]) -> None:
+        self.links = links
+        self._files = tuple(files)
+        self._next_s = 0.0  # when what is due is stored at the earliest
+        self._failure = ""
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Frames that were not taken, by link and reason."""
+        return Counter(
+            {
+                f"{link}: {reason}": count
+                for link, signing in self.links.items()
+                for reason, count in signing.rejected.items()
+            }
+        )
+
+    def advance(self, unix_us: int) -> None:
+        """Set the clocks of all keys to a time that is not before theirs."""
+        for file in self._files:
+            file.key.advance(unix_us)
+
+    def open(self) -> None:
+        """Store what the clocks will not fall behind, before anything is signed.
+
+        Raises
+        ------
+        ConfigError
+            If that cannot be stored.
+        """
+        for file in self._files:
+            snapshot = file.key.snapshot()
+            failure = file.write(snapshot)
+            if failure:
+                raise ConfigError(f"{failure}: a signing key's clock has to be stored there")
+            file.key.stored(snapshot)
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether `store` has something to do, at a time in seconds that does not jump."""
+        due = now_s >= self._next_s and any(file.key.is_due for file in self._files)
+        if due:
+            self._next_s = now_s + AGAIN_S
+        return due
+
+    async def store(self) -> None:
+        """Store what is due, in a thread: a memory card can take longer than an epoch."""
+        failure = ""
+        for file in self._files:
+            if file.key.is_due:
+                snapshot = file.key.snapshot()
+                failed = await asyncio.to_thread(file.write, snapshot)
+                failure = failure or failed
+                if not failed:
+                    file.key.stored(snapshot)
+        if not failure:
+            self._next_s = 0.0
+        elif failure != self._failure:
+            _log.error("a signing key's clock is not stored: %s", failure)
+        self._failure = failure
+
+    def close(self) -> None:
+        """Store the clocks as they are."""
+        for file in self._files:
+            file.write(file.key.snapshot(is_last=True))
+
+
+def state_path(path: Path) -> Path:
+    """Where the state of a key is kept."""
+    return path.with_name(f"{path.name}.state")
+
+
+def open_keys(config: Config) -> Keys:
+    """Read the keys that the links name. A file that several name is one key.
+
+    Raises
+    ------
+    ConfigError
+        In one line: which key of the configuration, what was found, what was expected.
+    """
+    files: dict[Path, KeyFile] = {}
+    links: dict[str, LinkSigning] = {}
+    for i, link in enumerate(config.links):
+        if link.signing is None:
+            continue
+        path = Path(link.signing.key).absolute()
+        where = f"links.{i}.signing.key: {path}: "
+        if path not in files:
+            secret = _read_secret(path, where, may_be_missing=_may_be_set_up(config, path))
+            files[path] = KeyFile(path, SigningKey(secret, _read_state(path, where)))
+        link_id = i % 256 if link.signing.link_id is None else link.signing.link_id
+        links[link.name] = LinkSigning(files[path].key, link_id, link.signing)
+    return Keys(files.values(), links)
+
+
+def _may_be_set_up(config: Config, path: Path) -> bool:
+    """Whether some link may bring a key."""
+    signings = [link.signing for link in config.links if link.signing]
+    return any(each.setup and Path(each.key).absolute() == path for each in signings)
+
+
+def _read_secret(path: Path, where: str, may_be_missing: bool) -> bytes:
+    content = _read_private(path, where)
+    if content is None:
+        if may_be_missing:
+            return b""
+        raise ConfigError(f"{where}found no file, expected {EXPECTED}")
+    if len(content) == KEY_SIZE:
+        secret = content
+    else:
+        try:
+            secret = bytes.fromhex(content.decode("ascii"))
+        except ValueError:
+            secret = b""
+    if len(secret) != KEY_SIZE or not any(secret):  # what was found is not for everyone to read
+        raise ConfigError(f"{where}found something else, expected {EXPECTED}")
+    return secret
+
+
+def _read_state(path: Path, where: str) -> SigningState:
+    content = _read_private(state_path(path), where)
+    if content is None:
+        return SigningState()
+    try:
+        return msgspec.json.decode(content, type=SigningState)
+    except msgspec.DecodeError:
+        _log.warning("%sfound %s damaged: the clock starts anew", where, state_path(path).name)
+        return SigningState()
+
+
+def _read_private(path: Path, where: str) -> bytes | None:
+    """Content of a file that nobody but its owner may read; None: there is none."""
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            if status.st_mode & OTHERS:
+                mode = stat.S_IMODE(status.st_mode)
+                raise ConfigError(
+                    f"{where}found {path.name} with mode {mode:04o}, expected 0600 or 0400: "
+                    "readable by its owner alone"
+                )
+            if status.st_uid not in {0, os.geteuid()}:
+                raise ConfigError(
+                    f"{where}found {path.name} owned by user {status.st_uid}, "
+                    f"expected {os.geteuid()}, who runs this"
+                )
+            return file.read()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(f"{where}{error.strerror or error}") from None
