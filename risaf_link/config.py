@@ -19,6 +19,7 @@ from risaf_link.core.tunable import Tunable
 from risaf_link.errors import ConfigError, LinkError
 from risaf_link.links import open_link
 from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.requests import RequestedRates
 from risaf_link.mavlink.signing import SigningParameters
 from risaf_link.mavlink.telemetry import DEFAULT_RATES, Rates
 from risaf_link.pipeline import PipelineParameters
@@ -37,12 +38,13 @@ class MavlinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """One link; `emit` None: the default set; `signing` None: nothing is signed or verified."""
+    """One link."""
 
     name: Annotated[str, Meta(min_length=1)]
     url: str
-    emit: Rates | None = None
-    signing: SigningParameters | None = None
+    emit: Rates | None = None  # None: the default set
+    request: RequestedRates | None = None  # None: what is needed, where an autopilot is heard
+    signing: SigningParameters | None = None  # None: nothing is signed or verified
 
 
 class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):

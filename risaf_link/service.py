@@ -20,6 +20,8 @@ from risaf_link.mavlink.component import Component
 from risaf_link.mavlink.frame import Frame, FrameParser
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.parameters import Parameters
+from risaf_link.mavlink.peers import Terms
+from risaf_link.mavlink.requests import Requests
 from risaf_link.mavlink.signing import SETUP_SIGNING, Rejection
 from risaf_link.pipeline import Pipeline
 
@@ -85,10 +87,17 @@ class Service:
             parameters,
             self.pipeline,
             Identity(*config.own, adopts=config.mavlink.system_id is None),
-            rates={link.name: link.emit for link in config.links if link.emit is not None},
-            pace={link.name: _pace(link) for link in self.links},
+            links={
+                link.name: Terms(link.emit, _pace(made), self._keys.links.get(link.name))
+                for link, made in zip(config.links, self.links, strict=True)
+            },
             keep=self._keep if kept.path else None,
-            signing=self._keys.links,
+            requests=Requests(
+                {link.name: link.request for link in config.links},
+                config.array.encodings,
+                config.gps.messages,
+                {link.name: link.bytes_per_s for link in self.links},
+            ),
         )
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]

@@ -219,6 +219,11 @@ async def test_a_ground_station_that_signs_on_a_bad_link(signed_service):
     assert found["signed"]
 
 
+async def test_an_autopilot_is_asked_for_what_the_array_does_not_bring(service):
+    asked = await client("autopilot.py", f"udpout:127.0.0.1:{service.port}", 2)
+    assert asked == {str(IDS["GPS_RAW_INT"]): 200_000, str(IDS["SYSTEM_TIME"]): 1_000_000}
+
+
 @pytest.mark.skipif(not find_spec("mavsdk"), reason="mavsdk is not installed")
 @pytest.mark.parametrize("is_bad", [False, True], ids=["good link", "bad link"])
 async def test_mavsdk_takes_us_for_a_component_and_tunes_it(service, is_bad):

@@ -20,6 +20,7 @@ from risaf_link.core.heading import HeadingState
 from risaf_link.core.health import SensorState
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import FrameParser
+from risaf_link.mavlink.peers import Terms
 from risaf_link.pipeline import Pipeline
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = range(6)
@@ -138,7 +139,7 @@ class TestIntervals:
         assert self.rate(network, NEAR) == 50
 
     def test_a_silent_link_can_be_asked_for_a_stream(self):
-        network = Network(rates={"ground": {}})
+        network = Network(links={"ground": Terms(rates={})})
         network.command(SET, QUATERNION, 1e6 / 20)
         assert (self.rate(network, NEAR), self.rate(network, FAR)) == (20, 0)
 

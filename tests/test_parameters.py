@@ -12,6 +12,7 @@ from wire import frame
 
 from risaf_link.config import Config
 from risaf_link.mavlink.parameters import Parameters, parameters_of
+from risaf_link.mavlink.peers import Terms
 
 ALL = parameters_of(Config)
 
@@ -49,7 +50,7 @@ def test_the_list_is_whole_in_order_and_paced(network):
 
 
 def test_a_slow_link_gets_the_list_at_its_pace():
-    network = Network(pace={"ground": 5.0})
+    network = Network(links={"ground": Terms(pace=5.0)})
     network.wait(0.1)
     network.send("PARAM_REQUEST_LIST")
     assert len(of(network.wait(2)[NEAR], "PARAM_VALUE")) == 10
@@ -156,7 +157,7 @@ def test_rates_change_what_is_sent_to_who_has_not_asked(network):
 
 
 def test_a_silent_link_answers_but_hears_nothing_else():
-    network = Network(rates={"ground": {}})
+    network = Network(links={"ground": Terms(rates={})})
     assert not network.wait(3)
     (answer,) = network.set("FUS_GATE", 6.0)
     assert answer.param_value == 6.0

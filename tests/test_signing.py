@@ -11,6 +11,7 @@ from streams import KEY, ROOT, STOCK, codec, made, message, parsed, payloads, se
 from wire import frame
 
 from risaf_link.mavlink.frame import Frame, encode
+from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.signing import (
     LATEST,
     MOST_STREAMS,
@@ -262,7 +263,7 @@ def setup(secret: bytes, to=OWN, ticks: int = 5) -> dict:
 
 
 def network(signing: LinkSigning) -> Network:
-    return Network(signing={"ground": signing})
+    return Network(links={"ground": Terms(signing=signing)})
 
 
 def test_the_first_key_may_be_set_where_that_is_configured():

@@ -22,10 +22,11 @@ from risaf_link.mavlink.gyro_calibration import GyroCalibration, Report
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.notices import Notice, Notices, Severity, statustexts
 from risaf_link.mavlink.parameters import Parameters
-from risaf_link.mavlink.peers import EMITTED, Peers
+from risaf_link.mavlink.peers import ANY, EMITTED, Peers, Terms
 from risaf_link.mavlink.pulse import Pulse
-from risaf_link.mavlink.signing import KEY_SIZE, SETUP_SIGNING, LinkSigning, setup_in
-from risaf_link.mavlink.telemetry import Rates, heartbeat
+from risaf_link.mavlink.requests import Requests
+from risaf_link.mavlink.signing import KEY_SIZE, SETUP_SIGNING, setup_in
+from risaf_link.mavlink.telemetry import heartbeat
 from risaf_link.mavlink.tuning import Answer, Tuning
 
 CAPABILITIES = 8 | 16 | 8192
@@ -75,14 +76,12 @@ class Component:
         Of a configuration with an `emit`: the rates of links that have none of their own.
     estimator : Estimator
     identity : Identity
-    rates : mapping
-        Link's name to its own rates.
-    pace : mapping
-        Link's name to how many PARAM_VALUE a second it takes at most.
+    links : mapping
+        Link's name to its terms. Frames that its signing rejects must not get here.
     keep : callable or None
         Begins to store parameters, by name, whose end is told by `kept`; None: there is no place.
-    signing : mapping
-        Link's name to how it is signed. Frames that it rejects must not get here.
+    requests : Requests or None
+        For what the autopilot is asked; None: for nothing.
 
     Attributes
     ----------
@@ -96,19 +95,19 @@ class Component:
         estimator: Estimator,
         identity: Identity,
         *,
-        rates: Mapping[str, Rates] | None = None,
-        pace: Mapping[str, float] | None = None,
+        links: Mapping[str, Terms] | None = None,
         keep: Callable[[dict[str, float]], None] | None = None,
-        signing: Mapping[str, LinkSigning] | None = None,
+        requests: Requests | None = None,
     ) -> None:
         self.trouble = ""
         self._parameters = parameters
         self._tuned = parameters.tuned
         self._estimator = estimator
         self._identity = identity
-        self._signing = signing or {}
-        self._peers = Peers(*identity.own, parameters.tuned.emit, rates or {}, self._signing)
-        self._pace = dict(pace or {})
+        self._links = links or {}
+        self._requests = requests or Requests({})
+        self._peers = Peers(*identity.own, parameters.tuned.emit, self._links)
+        self._pace = {name: terms.pace for name, terms in self._links.items()}
         self._keep = keep
         self._stored = dict(parameters.kept)
         self._tuning = Tuning(parameters)
@@ -145,6 +144,7 @@ class Component:
         """
         own = self._identity.own
         self._received_us = received_us
+        self._requests.hear(frame, peer, own)
         if frame.message_id not in ORDERS or (frame.system, frame.component) == own:
             return
         if self._identity.hear(frame, received_us):
@@ -182,6 +182,8 @@ class Component:
             self._report(self._calibration.end("failed: no samples"))
         for notice in self._notices.due(now_us, self._pulse.has_stalled, self.trouble):
             self._tell(notice)
+        for peer, fields in self._requests.advance(now_us):
+            self._outbox.append((peer, "COMMAND_LONG", fields))
         for peer, answer in self._tuning.due(seconds, self._pace):
             self._outbox.append((peer, answer.name, answer.fields))
 
@@ -251,7 +253,7 @@ class Component:
 
     def _set_up_signing(self, frame: Frame, peer: Peer) -> None:
         """Take another key, if it is for us alone and the link is one that may set it."""
-        signing, setup = self._signing.get(peer[0]), setup_in(frame)
+        signing, setup = self._links.get(peer[0], ANY).signing, setup_in(frame)
         if signing is None or not signing.takes_setup or setup.to != self._identity.own:
             return
         if setup.secret == bytes(KEY_SIZE):

@@ -1,6 +1,8 @@
 """Who listens to us, and what each of them gets: rates and sequence numbers of its own."""
 
+import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import get_args
 
 from risaf_link.mavlink.commands import Peer
@@ -17,6 +19,18 @@ EMITTED: dict[int, Message] = {IDS[name]: name for name in get_args(Message)}
 """Messages that may be asked for, by their ids."""
 
 
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What holds for all peers of one link."""
+
+    rates: Rates | None = None  # Hz; None: the default ones
+    pace: float = math.inf  # how many PARAM_VALUE a second the link takes at most
+    signing: LinkSigning | None = None  # None: nothing is signed
+
+
+ANY = Terms()
+
+
 class Peers:
     """The emitters of all peers.
 
@@ -26,32 +40,25 @@ class Peers:
         Whom the frames come from.
     rates : dict
         Of links without rates of their own.
-    by_link : mapping
-        Link's name to its own rates.
-    signing : mapping
-        Link's name to how it is signed.
+    links : mapping
+        Link's name to its terms.
     """
 
     def __init__(
-        self,
-        system: int,
-        component: int,
-        rates: Rates,
-        by_link: Mapping[str, Rates],
-        signing: Mapping[str, LinkSigning],
+        self, system: int, component: int, rates: Rates, links: Mapping[str, Terms]
     ) -> None:
         self._own = system, component
         self._rates = rates
-        self._by_link = by_link
-        self._signing = signing
+        self._links = links
         self._emitters: dict[Peer, Emitter] = {}
 
     def emitter(self, peer: Peer) -> Emitter:
         """The one that makes the frames for a peer."""
         emitter = self._emitters.get(peer)
         if emitter is None:
-            rates = self._by_link.get(peer[0], self._rates)
-            emitter = Emitter(rates, *self._own, self._signing.get(peer[0]))
+            terms = self._links.get(peer[0], ANY)
+            rates = self._rates if terms.rates is None else terms.rates
+            emitter = Emitter(rates, *self._own, terms.signing)
             self._emitters[peer] = emitter
             if len(self._emitters) > MOST_PEERS:
                 del self._emitters[next(iter(self._emitters))]
@@ -69,7 +76,8 @@ class Peers:
         """Change the rates of links without rates of their own."""
         self._rates = rates
         for (link, _), emitter in self._emitters.items():
-            emitter.set_defaults(self._by_link.get(link, rates))
+            own = self._links.get(link, ANY).rates
+            emitter.set_defaults(rates if own is None else own)
 
     def rename(self, system: int) -> None:
         """Speak under another system id from now on."""
