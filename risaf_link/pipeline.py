@@ -66,11 +66,12 @@ class Pipeline:
         p = parameters
         sensors = p.array.sensors or (len(calibration.gyros) if calibration else 0)
         self.ingest = Ingest(p.array, p.gps, own)
-        self._decisive = {*self.ingest.message_ids, IDS["SYSTEM_TIME"]} - SAMPLES
+        clocks = {IDS["SYSTEM_TIME"], IDS["TIMESYNC"]}
+        self._decisive = self.ingest.message_ids - SAMPLES | clocks
         self.assembler = EpochAssembler(structs.replace(p.array, sensors=sensors))
         self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
-        self._clock = VehicleClock()
+        self._clock = VehicleClock(own[1])
         self._parameters = p
         self._estimator = Estimator(p.fusion, p.attitude, p.heading)
         self._health = self._estimator.fusion.health()
@@ -103,6 +104,10 @@ class Pipeline:
     def adopt(self, own: tuple[int, int]) -> None:
         """Take note that this service has other ids now."""
         self.ingest.own = own
+
+    def now_us(self, unix_us: int) -> int:
+        """What the clock of the estimates shows, us, at a time in microseconds since 1970."""
+        return self._clock.now_us(unix_us)
 
     def step(self, frame: Frame, received_us: int) -> list[Estimate]:
         """Take one frame; the estimates that became possible by it, one an epoch.

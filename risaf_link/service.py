@@ -223,7 +223,7 @@ class Service:
         loop = asyncio.get_running_loop()
         while True:
             self._look_after_keys(loop.time())
-            self._component.advance(round(loop.time() * 1e6))
+            self._component.advance(round(loop.time() * 1e6), self._clock_us())
             self._hand_out(self._component.collect(self._peers()))
             await asyncio.sleep(TICK_S)
 

@@ -50,6 +50,9 @@ class Recorder:
     def adopt(self, own: tuple[int, int]) -> None:
         self.done.append(own)
 
+    def now_us(self, unix_us: int) -> int:
+        return unix_us - 7_000_000
+
 
 class Network:
     """A component, two ground stations on one link, and time."""

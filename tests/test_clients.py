@@ -219,9 +219,10 @@ async def test_a_ground_station_that_signs_on_a_bad_link(signed_service):
     assert found["signed"]
 
 
-async def test_an_autopilot_is_asked_for_what_the_array_does_not_bring(service):
-    asked = await client("autopilot.py", f"udpout:127.0.0.1:{service.port}", 2)
-    assert asked == {str(IDS["GPS_RAW_INT"]): 200_000, str(IDS["SYSTEM_TIME"]): 1_000_000}
+async def test_an_autopilot_is_asked_for_what_the_array_does_not_bring_and_for_its_time(service):
+    found = await client("autopilot.py", f"udpout:127.0.0.1:{service.port}", 2)
+    assert found["asked"] == {str(IDS["GPS_RAW_INT"]): 200_000, str(IDS["SYSTEM_TIME"]): 1_000_000}
+    assert abs(found["offsets_s"][-1]) < 0.05  # our stamps are on the autopilot's clock by then
 
 
 @pytest.mark.skipif(not find_spec("mavsdk"), reason="mavsdk is not installed")

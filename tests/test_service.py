@@ -21,7 +21,7 @@ from risaf_link.mavlink.frame import Frame, FrameParser
 from risaf_link.mavlink.peers import EMITTED
 from risaf_link.mavlink.tlog import TlogReader, record
 from risaf_link.replay import OutputLog, Replay, Selection
-from risaf_link.service import Service
+from risaf_link.service import Service, unix_us
 from risaf_link.sim.scenario import scenario
 from risaf_link.sim.stream import frames
 
@@ -182,6 +182,27 @@ async def test_what_a_ground_station_sets_is_in_the_recording_and_replays_bit_fo
     live = outputs(ground.heard)
     assert replayed(config, recording) == live
     recording.write_bytes(without(recording.read_bytes(), {IDS["PARAM_SET"]}))
+    assert replayed(config, recording) != live
+
+
+async def test_stamps_on_the_autopilots_clock_replay_bit_for_bit(ground, tmp_path):
+    recording = tmp_path / "drive.tlog"
+    config = config_for(ground, f"{{name: recording, url: 'tlog://{recording}'}}")
+    codec = public.MAVLink(None, 1, 1)
+    async with Running(config, up=3) as service:
+        for k, burst in enumerate(bursts()):
+            if k == 10:
+                beat = codec.heartbeat_encode(10, 3, 0, 0, 4)
+                ground.transport.sendto(beat.pack(codec), address_of(service))
+            if k >= 20 and k % 5 == 0:
+                told = codec.timesync_encode(
+                    (5_000_000 + 10_000 * k) * 1000, unix_us() * 1000 + 191
+                )
+                ground.transport.sendto(told.pack(codec), address_of(service))
+            await feed(ground, service, [burst])
+    live = outputs(ground.heard)
+    assert replayed(config, recording) == live
+    recording.write_bytes(without(recording.read_bytes(), {IDS["TIMESYNC"]}))
     assert replayed(config, recording) != live
 
 

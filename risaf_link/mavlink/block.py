@@ -142,9 +142,10 @@ class BlockReader:
 def _kinds(ingest: Ingest, apart: Collection[int]) -> bytearray:
     """Kind of every message, by its id."""
     kinds = dict.fromkeys((*apart, *ingest.message_ids), Kind.APART)
-    aside = {IDS[name] for name in (*READERS, "HEARTBEAT", "SYSTEM_TIME")}
+    clocks = {IDS["SYSTEM_TIME"], IDS["TIMESYNC"]}
+    aside = {IDS[name] for name in (*READERS, "HEARTBEAT")}
     kinds |= dict.fromkeys(ingest.refused_ids, Kind.REFUSED)
-    kinds |= dict.fromkeys(aside & {*ingest.message_ids, IDS["SYSTEM_TIME"]}, Kind.ASIDE)
+    kinds |= dict.fromkeys(aside & ingest.message_ids | clocks, Kind.ASIDE)
     kinds |= {IDS["GYRO_ARRAY"]: Kind.GYROS, IDS["ACCEL_ARRAY"]: Kind.FORCES}
     by_id = bytearray(max(kinds) + 1)
     for message_id, kind in kinds.items():

@@ -1,9 +1,10 @@
 """The vehicle's boot clock, for an array that counts its own time.
 
 Two clocks are compared through a third, the arrival time: of all that came within some seconds, the
-frame that was least delayed tells best how far a sender's clock is ahead of it. When the array's
-clock seems to jump, the third may have been set or the link may have stalled: the offset that was
-found before holds until the vehicle tells its time again.
+frame that was least delayed tells best how far a sender's clock is ahead of it. Better still are
+the autopilot's answers to TIMESYNC, which say how long they took. When the array's clock seems to
+jump, the third may have been set or the link may have stalled: the offset that was found before
+holds until the vehicle tells its time again.
 """
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.timesync import Sample, Synchronised, sample_in
 
 WINDOW_US = 10_000_000
 SAME_CLOCK_US = 500_000  # clocks that differ by less are one
@@ -64,14 +66,23 @@ class _Lead:
 class VehicleClock:
     """Puts the array's time stamps on the boot clock of the vehicle's autopilot.
 
-    An autopilot is known by its HEARTBEAT, its clock by SYSTEM_TIME. Stamps stay as they are while
-    no autopilot has told its time, and where both clocks are the same.
+    An autopilot is known by its HEARTBEAT, its clock by SYSTEM_TIME and by its answers to TIMESYNC.
+    Stamps stay as they are while no autopilot has told its time, and where both clocks are the
+    same. They do not go back, unless by so much that a clock was started anew.
+
+    Parameters
+    ----------
+    component : int
+        That of ours which asks with TIMESYNC.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, component: int = 191) -> None:
+        self._component = component
         self._autopilot: tuple[int, int] | None = None
         self._vehicle, self._array = _Lead(), _Lead()
+        self._synchronised = Synchronised()
         self._offset_us = 0
+        self._last_us: int | None = None  # stamp
 
     def hear(self, frame: Frame, received_us: int) -> None:
         """Take note of a frame that may tell of an autopilot or of its time."""
@@ -83,26 +94,69 @@ class VehicleClock:
         elif frame.message_id == IDS["SYSTEM_TIME"] and sender == self._autopilot:
             _, boot_ms = _SYSTEM_TIME(frame.payload)
             self._vehicle.note(boot_ms * 1000, received_us)
+            lead_us = boot_ms * 1000 - received_us
+            if self._synchronised.is_contradicted(lead_us, received_us, SAME_CLOCK_US):
+                self._synchronised = Synchronised()
+        elif frame.message_id == IDS["TIMESYNC"] and sender == self._autopilot:
+            sample = sample_in(frame, self._component, received_us)
+            if sample:
+                self._synchronise(sample)
+
+    def now_us(self, received_us: int) -> int:
+        """What the clock of our stamps shows at a time since 1970; that time, if none is known."""
+        leads = self._leads_of_vehicle(np.array([received_us]))
+        if self._array.lead_us is None:
+            return received_us + (int(leads[0]) if leads is not None else 0)
+        offset_us = self._offset_us if abs(self._offset_us) >= SAME_CLOCK_US else 0
+        return max(received_us + self._array.lead_us + offset_us, 0)
 
     def boot_us(self, time_us: int, received_us: int) -> int:
         """Time of an epoch, which has just been received, on the vehicle's clock."""
         if self._array.note(time_us, received_us):
-            self._vehicle = _Lead()
-        if self._vehicle.lead_us is not None and self._array.lead_us is not None:
-            self._offset_us = self._vehicle.lead_us - self._array.lead_us
-        if abs(self._offset_us) < SAME_CLOCK_US:
-            return time_us
-        return max(time_us + self._offset_us, 0)
+            self._vehicle, self._synchronised = _Lead(), Synchronised()
+        leads = self._leads_of_vehicle(np.array([received_us]))
+        if leads is not None and self._array.lead_us is not None:
+            self._offset_us = int(leads[0]) - self._array.lead_us
+        return int(self._stamps(np.array([time_us]), np.array([self._offset_us]))[0])
 
     def boot_times(self, time_us: Times, received_us: Times) -> Times:
         """Do what `boot_us` does, for k epochs that were received one after another."""
-        leads_us = self._array.note_steady(time_us, received_us)
+        ends_us = int(received_us[0]), int(received_us[-1])
+        is_steady = len({self._synchronised.is_known(end_us) for end_us in ends_us}) == 1
+        leads_us = self._array.note_steady(time_us, received_us) if is_steady else None
         if leads_us is None:
             pairs = zip(time_us.tolist(), received_us.tolist(), strict=True)
             return np.array([self.boot_us(*pair) for pair in pairs])
         offsets_us = np.full(len(time_us), self._offset_us)
-        if self._vehicle.lead_us is not None:
-            offsets_us = self._vehicle.lead_us - leads_us
+        leads_of_vehicle = self._leads_of_vehicle(received_us)
+        if leads_of_vehicle is not None:
+            offsets_us = leads_of_vehicle - leads_us
             self._offset_us = int(offsets_us[-1])
+        return self._stamps(time_us, offsets_us)
+
+    def _synchronise(self, sample: Sample) -> None:
+        """Take an answer of the autopilot's."""
+        is_new = self._synchronised.is_before(sample)
+        if self._synchronised.note(sample) and not is_new:
+            self._array = _Lead()  # the arrival times have jumped, not the vehicle
+        if is_new:
+            self._vehicle = _Lead()
+
+    def _leads_of_vehicle(self, received_us: Times) -> Times | None:
+        """How far the vehicle's clock is ahead of arrival times; None: it is not known."""
+        if self._synchronised.is_known(int(received_us[-1])):
+            return self._synchronised.leads(received_us)
+        lead_us = self._vehicle.lead_us
+        return None if lead_us is None else np.full(len(received_us), lead_us)
+
+    def _stamps(self, time_us: Times, offsets_us: Times) -> Times:
+        """Stamps of k epochs, (k,) each, that do not go back."""
         same = np.abs(offsets_us) < SAME_CLOCK_US
-        return np.where(same, time_us, np.maximum(time_us + offsets_us, 0))
+        stamps = np.where(same, time_us, np.maximum(time_us + offsets_us, 0))
+        before_us = int(stamps[0]) if self._last_us is None else self._last_us
+        if before_us > stamps[0] or (stamps[1:] < stamps[:-1]).any():
+            for i, stamp in enumerate(stamps.tolist()):
+                falls = 0 < before_us - stamp < SAME_CLOCK_US
+                before_us = stamps[i] = before_us if falls else stamp
+        self._last_us = int(stamps[-1])
+        return stamps

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from risaf_link import __version__
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.rotation import Floats
+from risaf_link.mavlink import timesync
 from risaf_link.mavlink.commands import Command, Order, Peer, Result, order_in, whole
 from risaf_link.mavlink.dialect import IDS, name_of
 from risaf_link.mavlink.frame import Frame
@@ -29,6 +30,7 @@ from risaf_link.mavlink.signing import KEY_SIZE, SETUP_SIGNING, setup_in
 from risaf_link.mavlink.telemetry import heartbeat
 from risaf_link.mavlink.tuning import Answer, Tuning
 
+TIMESYNC = IDS["TIMESYNC"]
 CAPABILITIES = 8 | 16 | 8192
 """MAV_PROTOCOL_CAPABILITY: COMMAND_INT, PARAM_ENCODE_BYTEWISE (REAL32 is the same in both ways, and
 one must be told), MAVLINK2."""
@@ -57,6 +59,9 @@ class Estimator(Protocol):
 
     def adopt(self, own: tuple[int, int]) -> None:
         """Take note of our ids."""
+
+    def now_us(self, unix_us: int) -> int:
+        """What the clock of the estimates shows, us, at a time since 1970."""
 
 
 class StorageAction(IntEnum):
@@ -145,6 +150,8 @@ class Component:
         own = self._identity.own
         self._received_us = received_us
         self._requests.hear(frame, peer, own)
+        if frame.message_id == TIMESYNC:
+            self._answer_timesync(frame, peer)
         if frame.message_id not in ORDERS or (frame.system, frame.component) == own:
             return
         if self._identity.hear(frame, received_us):
@@ -166,13 +173,15 @@ class Component:
         self._notices.observe(estimate)
         self._report(self._calibration.observe(estimate))
 
-    def advance(self, now_us: int) -> None:
-        """Do what is due by time: HEARTBEAT, notices, lists of parameters.
+    def advance(self, now_us: int, unix_us: int | None = None) -> None:
+        """Do what is due by time: HEARTBEAT, notices, lists of parameters, requests.
 
         Parameters
         ----------
         now_us : int
             Microseconds of a clock that does not jump.
+        unix_us : int or None
+            Microseconds since 1970; None: the autopilot is not asked for its time.
         """
         seconds = (now_us - self._advanced_us) / 1e6 if self._advanced_us is not None else 0.0
         self._advanced_us = now_us
@@ -184,6 +193,10 @@ class Component:
             self._tell(notice)
         for peer, fields in self._requests.advance(now_us):
             self._outbox.append((peer, "COMMAND_LONG", fields))
+        whom = self._requests.due_timesync() if unix_us is not None else None
+        if whom and unix_us is not None:
+            fields = timesync.request(unix_us, self._identity.component)
+            self._outbox.append((whom, "TIMESYNC", fields))
         for peer, answer in self._tuning.due(seconds, self._pace):
             self._outbox.append((peer, answer.name, answer.fields))
 
@@ -250,6 +263,16 @@ class Component:
         self._estimator.configure(self._tuned)
         if self._tuned.emit != before.emit:
             self._peers.set_defaults(self._tuned.emit)
+
+    def _answer_timesync(self, frame: Frame, peer: Peer) -> None:
+        """Tell the time of our stamps to who asks for it."""
+        asked = timesync.timesync_in(frame)
+        system, component = self._identity.own
+        for_us = asked.to[0] in {0, system} and asked.to[1] in {0, component}
+        if asked.tc1 == 0 and for_us and (frame.system, frame.component) != self._identity.own:
+            clock_us = self._estimator.now_us(self._received_us)
+            fields = timesync.answer(asked, (frame.system, frame.component), clock_us)
+            self._outbox.append((peer, "TIMESYNC", fields))
 
     def _set_up_signing(self, frame: Frame, peer: Peer) -> None:
         """Take another key, if it is for us alone and the link is one that may set it."""

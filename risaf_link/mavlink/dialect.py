@@ -29,9 +29,21 @@ class ComponentInformationBasic:
     unpacker = struct.Struct("<QII32s32s24s24s32s")
 
 
+class Timesync:
+    """TIMESYNC with the extension by which an answer says whose request it answers."""
+
+    id = 111
+    msgname = "TIMESYNC"
+    fieldnames = ordered_fieldnames = ("tc1", "ts1", "target_system", "target_component")
+    lengths = (1,) * len(fieldnames)
+    crc_extra = 34
+    unpacker = struct.Struct("<qqBB")
+
+
 MESSAGES: dict[int, Any] = {
     ComponentInformationBasic.id: ComponentInformationBasic,
     **public_dialect.mavlink_map,
+    Timesync.id: Timesync,
     **risaf.mavlink_map,
 }
 """Message class of the generated dialects, by message id."""

@@ -32,6 +32,7 @@ Requested = Literal[
     "GPS2_RAW",
     "GLOBAL_POSITION_INT",
     "SYSTEM_TIME",
+    "TIMESYNC",
 ]
 RequestedRates = dict[Requested, Annotated[float, Meta(gt=0, le=1000)]]
 """Hz; what is not named is not asked for."""
@@ -181,7 +182,7 @@ class Requests:
         self._capacity = dict(capacity or {})
         self._autopilots: dict[Peer, _Autopilot] = {}
         self._at: Peer | None = None  # who is asked
-        self._now_us = 0
+        self._now_us = self._next_timesync_us = 0
         self._array_us: int | None = None  # when an array was last heard
 
     def hear(self, frame: Frame, peer: Peer, own: tuple[int, int]) -> None:
@@ -227,6 +228,15 @@ class Requests:
             return []
         return [(self._at, self._ask(due, autopilot))]
 
+    def due_timesync(self) -> Peer | None:
+        """Whom to ask for the time now: the one who is asked for the rest, once a second."""
+        rates = self._links.get(self._at[0]) if self._at else {}
+        rate = TIME_RATE if rates is None else rates.get("TIMESYNC", 0.0)
+        if not rate or self._now_us < self._next_timesync_us:
+            return None
+        self._next_timesync_us = self._now_us + round(1e6 / rate)
+        return self._at
+
     def _hear_array(self, frame: Frame) -> None:
         name = "GYRO_ARRAY" if frame.message_id == IDS["GYRO_ARRAY"] else "DEBUG_FLOAT_ARRAY"
         is_gyro = name == "GYRO_ARRAY" or _DEBUG(frame.payload)[0].rstrip(b"\0") == b"gyro"
@@ -270,7 +280,7 @@ class Requests:
         """What is needed on a link, and how fast it may come."""
         rates = self._links[link]
         if rates is not None:
-            needs = [_Need((name,), rate) for name, rate in rates.items()]
+            needs = [_Need((name,), rate) for name, rate in rates.items() if name != "TIMESYNC"]
         else:
             imus = IMUS if "IMU" in self._encodings else ()
             needs = [_Need(names, IMU_RATE) for names in imus]
