@@ -25,7 +25,10 @@ from risaf_link.mavlink.telemetry import DEFAULT_RATES, Rates
 from risaf_link.pipeline import PipelineParameters
 
 Id = Annotated[int, Meta(ge=1, le=255)]
-RATE_NAMES = ("RATE_ATT_QUAT", "RATE_GPS_HDG", "RATE_ARRAY", "RATE_HEALTH", "RATE_REASON")
+RATE_NAMES = (
+    *("RATE_ATT_QUAT", "RATE_GPS_HDG", "RATE_ARRAY", "RATE_HEALTH", "RATE_REASON"),
+    *("RATE_ATT_COV", "RATE_EST_STATUS", "RATE_NAMED"),
+)
 """Of the parameters that set the rates of `Message`s, in their order."""
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import all as public
 from vehicle import Vehicle
 
 from risaf_link.core.estimate import Estimate
@@ -12,7 +13,7 @@ from risaf_link.core.heading import HeadingState
 from risaf_link.core.rotation import yaw_of
 from risaf_link.mavlink import risaf
 from risaf_link.mavlink.frame import Frame, FrameParser
-from risaf_link.mavlink.telemetry import Emitter
+from risaf_link.mavlink.telemetry import DEFAULT_RATES, Emitter
 from risaf_link.pipeline import Pipeline, PipelineParameters
 from risaf_link.sim.receiver_faults import RECEIVER_FAULTS
 from risaf_link.sim.scenario import BOOT_US, scenario
@@ -182,6 +183,44 @@ def test_the_status_messages_say_what_the_estimate_says(drive):
     assert array.active == [5, 5, 5]
     assert (array.sensors_expected, array.sensors_valid, array.healthy) == (5, 5, 5)
     assert (array.epochs, array.epochs_incomplete, array.samples_lost) == (1300, 0, 0)
+
+
+def test_the_attitude_comes_with_its_variances(drive):
+    drive.go(10, course=1.0)
+    estimate = drive.go(3)
+    (told,) = heard(Emitter({"ATTITUDE_QUATERNION_COV": 5.0}, *OWN).emit(estimate))
+    attitude = estimate.attitude
+    assert told.time_usec == estimate.boot_us
+    assert told.q == pytest.approx(attitude.q_nb, abs=1e-7)
+    rates = (told.rollspeed, told.pitchspeed, told.yawspeed)
+    assert rates == pytest.approx(attitude.rate_b, abs=1e-7)
+    std = (attitude.roll_std, attitude.pitch_std, attitude.yaw_std)
+    assert told.covariance == pytest.approx(np.diag(np.square(std)).ravel(), rel=1e-6)
+
+
+def test_what_is_asked_for_beside_it_says_the_same(drive):
+    drive.go(10, course=1.0)
+    estimate = drive.go(3)
+    assert not {"ESTIMATOR_STATUS", "NAMED_VALUE_FLOAT"} & set(DEFAULT_RATES)
+    emitter = Emitter({"ESTIMATOR_STATUS": 1.0}, *OWN)
+    (status,) = heard(emitter.emit(estimate))
+    assert status.flags == public.ESTIMATOR_ATTITUDE
+    assert status.mag_ratio == pytest.approx(estimate.heading.innovation.test_ratio, rel=1e-6)
+    assert math.isnan(status.vel_ratio)
+    assert math.isnan(status.pos_horiz_accuracy)
+    named = heard([emitter.tell("NAMED_VALUE_FLOAT", estimate) for _ in range(16)])
+    values = {message.name: message.value for message in named}
+    assert [message.name for message in named[:8]] == [message.name for message in named[8:]]
+    assert len(values) == 8
+    assert values["yaw_std"] == pytest.approx(estimate.attitude.yaw_std, rel=1e-6)
+    assert values["hdg_ratio"] == pytest.approx(status.mag_ratio)
+    assert values["bias_z"] == pytest.approx(estimate.attitude.bias_b[2], rel=1e-6, abs=1e-12)
+    assert (values["healthy"], values["dead"]) == (5, 0)
+
+
+def heard(frames):
+    decoder = public.MAVLink(None)
+    return [decoder.parse_buffer(raw)[0] for raw in frames]
 
 
 def test_messages_are_thinned_out_on_the_estimates_own_time(drive):

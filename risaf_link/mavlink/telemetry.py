@@ -10,7 +10,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from risaf_link.core.estimate import Estimate
-from risaf_link.core.heading import HeadingSource
+from risaf_link.core.heading import HeadingSource, HeadingState
 from risaf_link.core.health import ArrayHealth, SensorState
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import encode
@@ -22,6 +22,9 @@ Message = Literal[
     "ARRAY_STATUS",
     "ARRAY_SENSOR_HEALTH",
     "ARRAY_SENSOR_REASON",
+    "ATTITUDE_QUATERNION_COV",
+    "ESTIMATOR_STATUS",
+    "NAMED_VALUE_FLOAT",
 ]
 
 Rates = dict[Message, Annotated[float, Meta(gt=0, le=10_000)]]
@@ -33,12 +36,15 @@ DEFAULT_RATES: Rates = {
     "ARRAY_STATUS": 1.0,
     "ARRAY_SENSOR_HEALTH": 1.0,
     "ARRAY_SENSOR_REASON": 1.0,
+    "ATTITUDE_QUATERNION_COV": 5.0,
 }
-"""What a link emits unless told otherwise, Hz."""
+"""What a link emits unless told otherwise, Hz. ESTIMATOR_STATUS is not among it: ground stations
+take it for the autopilot's."""
 
 ONBOARD_CONTROLLER = 18  # MAV_TYPE
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 MAVLINK_VERSION = 3
+ESTIMATOR_ATTITUDE, ESTIMATOR_GPS_GLITCH = 1, 1024  # ESTIMATOR_STATUS_FLAGS
 UINT32_LIMIT = 2**32 - 1
 
 
@@ -82,7 +88,7 @@ class Emitter:
         self._sent = rates  # what is sent in fact
         self._component = component
         self._sequence = 0
-        self._next_sensor: dict[str, int] = {}  # of messages that tell of some sensors at a time
+        self._next_part: dict[str, int] = {}  # of messages that tell of some at a time
         self._periods: dict[str, int] = {}  # which period a message was last sent in
 
     @property
@@ -117,14 +123,18 @@ class Emitter:
         return self.frame(name, **self.fields(name, estimate))
 
     def fields(self, name: Message, estimate: Estimate) -> dict[str, Any]:
-        """What a message tells of an estimate; where it tells of some sensors, of the next ones."""
+        """What a message tells of an estimate; where it tells of a part, of the next one."""
+        if name == "NAMED_VALUE_FLOAT":
+            turn = self._next_part.get(name, 0)
+            self._next_part[name] = (turn + 1) % len(_NAMED)
+            return _named_value_float(estimate, turn)
         if name not in _ROUND_ROBIN:
             return _FIELDS[name](estimate)
         fields, most = _ROUND_ROBIN[name]
         n = len(estimate.array.health.state)
-        first = self._next_sensor.get(name, 0)
+        first = self._next_part.get(name, 0)
         first = first if first < n else 0
-        self._next_sensor[name] = first + most
+        self._next_part[name] = first + most
         return {
             "time_usec": estimate.boot_us,
             "first_sensor": first,
@@ -164,6 +174,41 @@ def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
         **dict(zip(("q1", "q2", "q3", "q4"), q_nb, strict=True)),
         **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rate_b, strict=True)),
         "repr_offset_q": (0.0, 0.0, 0.0, 0.0),
+    }
+
+
+def _attitude_quaternion_cov(estimate: Estimate) -> dict[str, Any]:
+    """The variances of roll, pitch and yaw; what they have in common is not told."""
+    attitude = estimate.attitude
+    variances = np.square((attitude.roll_std, attitude.pitch_std, attitude.yaw_std))
+    return {
+        "time_usec": estimate.boot_us,
+        "q": attitude.q_nb,
+        **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), attitude.rate_b, strict=True)),
+        "covariance": np.diag(variances).ravel(),
+    }
+
+
+def _estimator_status(estimate: Estimate) -> dict[str, Any]:
+    """The heading in the place of the compass; nothing is estimated of position and velocity."""
+    innovation = estimate.heading.innovation
+    is_rejecting = estimate.heading.state is HeadingState.REJECTING
+    flags = ESTIMATOR_ATTITUDE if estimate.attitude.aligned else 0
+    ratios = ("vel_ratio", "pos_horiz_ratio", "pos_vert_ratio", "hagl_ratio", "tas_ratio")
+    return {
+        "time_usec": estimate.boot_us,
+        "flags": flags | (ESTIMATOR_GPS_GLITCH if is_rejecting else 0),
+        "mag_ratio": innovation.test_ratio if innovation else math.nan,
+        **dict.fromkeys((*ratios, "pos_horiz_accuracy", "pos_vert_accuracy"), math.nan),
+    }
+
+
+def _named_value_float(estimate: Estimate, turn: int) -> dict[str, Any]:
+    name, value = _NAMED[turn]
+    return {
+        "time_boot_ms": estimate.boot_us // 1000 % 2**32,
+        "name": name,
+        "value": value(estimate),
     }
 
 
@@ -233,8 +278,25 @@ _ROUND_ROBIN: dict[str, tuple[Callable[[ArrayHealth, slice], dict[str, Any]], in
 }
 """Messages that tell of so many sensors at a time, one block after another."""
 
+_NAMED: tuple[tuple[str, Callable[[Estimate], float]], ...] = (
+    ("yaw_std", lambda e: e.attitude.yaw_std),  # rad
+    (
+        "hdg_innov",
+        lambda e: e.heading.innovation.value if e.heading.innovation else math.nan,
+    ),  # rad
+    ("hdg_ratio", lambda e: e.heading.innovation.test_ratio if e.heading.innovation else math.nan),
+    ("bias_x", lambda e: float(e.attitude.bias_b[0])),  # rad/s
+    ("bias_y", lambda e: float(e.attitude.bias_b[1])),
+    ("bias_z", lambda e: float(e.attitude.bias_b[2])),
+    ("healthy", lambda e: float(e.array.health.count(SensorState.HEALTHY))),  # sensors
+    ("dead", lambda e: float(e.array.health.count(SensorState.DEAD))),
+)
+"""Names of at most 10 characters, one after another."""
+
 _FIELDS: dict[str, Callable[[Estimate], dict[str, Any]]] = {
     "ATTITUDE_QUATERNION": _attitude_quaternion,
     "GPS_HEADING_STATUS": _gps_heading_status,
     "ARRAY_STATUS": _array_status,
+    "ATTITUDE_QUATERNION_COV": _attitude_quaternion_cov,
+    "ESTIMATOR_STATUS": _estimator_status,
 }
