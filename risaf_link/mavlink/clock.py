@@ -104,9 +104,8 @@ class VehicleClock:
 
     def now_us(self, received_us: int) -> int:
         """What the clock of our stamps shows at a time since 1970; that time, if none is known."""
-        leads = self._leads_of_vehicle(np.array([received_us]))
         if self._array.lead_us is None:
-            return received_us + (int(leads[0]) if leads is not None else 0)
+            return received_us + (self._lead_of_vehicle(received_us) or 0)
         offset_us = self._offset_us if abs(self._offset_us) >= SAME_CLOCK_US else 0
         return max(received_us + self._array.lead_us + offset_us, 0)
 
@@ -114,25 +113,40 @@ class VehicleClock:
         """Time of an epoch, which has just been received, on the vehicle's clock."""
         if self._array.note(time_us, received_us):
             self._vehicle, self._synchronised = _Lead(), Synchronised()
-        leads = self._leads_of_vehicle(np.array([received_us]))
-        if leads is not None and self._array.lead_us is not None:
-            self._offset_us = int(leads[0]) - self._array.lead_us
-        return int(self._stamps(np.array([time_us]), np.array([self._offset_us]))[0])
+        lead_us = self._lead_of_vehicle(received_us)
+        if lead_us is not None and self._array.lead_us is not None:
+            self._offset_us = lead_us - self._array.lead_us
+        is_same = abs(self._offset_us) < SAME_CLOCK_US
+        return self._steady(time_us if is_same else max(time_us + self._offset_us, 0))
 
     def boot_times(self, time_us: Times, received_us: Times) -> Times:
         """Do what `boot_us` does, for k epochs that were received one after another."""
-        ends_us = int(received_us[0]), int(received_us[-1])
-        is_steady = len({self._synchronised.is_known(end_us) for end_us in ends_us}) == 1
-        leads_us = self._array.note_steady(time_us, received_us) if is_steady else None
-        if leads_us is None:
+        times_us = self._boot_times(time_us, received_us) if len(time_us) > 1 else None
+        if times_us is None:
             pairs = zip(time_us.tolist(), received_us.tolist(), strict=True)
             return np.array([self.boot_us(*pair) for pair in pairs])
+        return times_us
+
+    def _boot_times(self, time_us: Times, received_us: Times) -> Times | None:
+        """Times of epochs at which all goes as usual; None: it does not, and nothing was noted."""
+        ends_us = int(received_us[0]), int(received_us[-1])
+        if len({self._synchronised.is_known(end_us) for end_us in ends_us}) > 1:
+            return None
+        leads_us = self._array.note_steady(time_us, received_us)
+        if leads_us is None:
+            return None
         offsets_us = np.full(len(time_us), self._offset_us)
-        leads_of_vehicle = self._leads_of_vehicle(received_us)
-        if leads_of_vehicle is not None:
-            offsets_us = leads_of_vehicle - leads_us
-            self._offset_us = int(offsets_us[-1])
-        return self._stamps(time_us, offsets_us)
+        if self._synchronised.is_known(ends_us[-1]):
+            offsets_us = self._synchronised.leads(received_us) - leads_us
+        elif self._vehicle.lead_us is not None:
+            offsets_us = self._vehicle.lead_us - leads_us
+        self._offset_us = int(offsets_us[-1])
+        same = np.abs(offsets_us) < SAME_CLOCK_US
+        stamps = np.where(same, time_us, np.maximum(time_us + offsets_us, 0))
+        if (stamps[1:] < stamps[:-1]).any() or stamps[0] < (self._last_us or 0):
+            return np.array([self._steady(stamp) for stamp in stamps.tolist()])
+        self._last_us = int(stamps[-1])
+        return stamps
 
     def _synchronise(self, sample: Sample) -> None:
         """Take an answer of the autopilot's."""
@@ -142,21 +156,15 @@ class VehicleClock:
         if is_new:
             self._vehicle = _Lead()
 
-    def _leads_of_vehicle(self, received_us: Times) -> Times | None:
-        """How far the vehicle's clock is ahead of arrival times; None: it is not known."""
-        if self._synchronised.is_known(int(received_us[-1])):
-            return self._synchronised.leads(received_us)
-        lead_us = self._vehicle.lead_us
-        return None if lead_us is None else np.full(len(received_us), lead_us)
+    def _lead_of_vehicle(self, received_us: int) -> int | None:
+        """How far the vehicle's clock is ahead of the arrival times; None: it is not known."""
+        if self._synchronised.is_known(received_us):
+            return self._synchronised.lead(received_us)
+        return self._vehicle.lead_us
 
-    def _stamps(self, time_us: Times, offsets_us: Times) -> Times:
-        """Stamps of k epochs, (k,) each, that do not go back."""
-        same = np.abs(offsets_us) < SAME_CLOCK_US
-        stamps = np.where(same, time_us, np.maximum(time_us + offsets_us, 0))
-        before_us = int(stamps[0]) if self._last_us is None else self._last_us
-        if before_us > stamps[0] or (stamps[1:] < stamps[:-1]).any():
-            for i, stamp in enumerate(stamps.tolist()):
-                falls = 0 < before_us - stamp < SAME_CLOCK_US
-                before_us = stamps[i] = before_us if falls else stamp
-        self._last_us = int(stamps[-1])
-        return stamps
+    def _steady(self, stamp_us: int) -> int:
+        """A stamp that does not go back a little."""
+        if self._last_us is not None and 0 < self._last_us - stamp_us < SAME_CLOCK_US:
+            return self._last_us
+        self._last_us = stamp_us
+        return stamp_us

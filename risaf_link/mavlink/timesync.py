@@ -99,7 +99,7 @@ class Synchronised:
     def note(self, sample: Sample) -> bool:
         """Take an answer; whether one of the clocks has jumped, and all that was known is gone."""
         is_known = self.is_known(sample.time_us)
-        expected_us = int(self.leads(np.array([sample.time_us]))[0])
+        expected_us = self.lead(sample.time_us)
         has_jumped = is_known and abs(sample.lead_us - expected_us) > JUMP_US
         if has_jumped or not is_known:
             self._samples.clear()
@@ -111,15 +111,19 @@ class Synchronised:
         """Whether another lead differs by so much, and no answer tells which is right."""
         if not self._samples or abs(now_us - self._samples[-1].time_us) < SILENT_US:
             return False
-        return abs(int(self.leads(np.array([now_us]))[0]) - lead_us) > by_us
+        return abs(self.lead(now_us) - lead_us) > by_us
 
     def is_before(self, sample: Sample) -> bool:
         """Whether the other's clock has gone back since its last answer: it was started anew."""
         last = self._samples[-1] if self._samples else None
         return last is not None and sample.time_us + sample.lead_us < last.time_us + last.lead_us
 
+    def lead(self, now_us: int) -> int:
+        """How far it is ahead at a time of ours."""
+        return round(self._lead_us + self.skew * (now_us - self._at_us))
+
     def leads(self, now_us: Times) -> Times:
-        """How far it is ahead at times of ours, (k,) us."""
+        """How far it is ahead at times of ours, (k,) us, as `lead` says it."""
         leads_us: Times = np.rint(self._lead_us + self.skew * (now_us - self._at_us)).astype(int)
         return leads_us
 
@@ -134,7 +138,7 @@ class Synchronised:
             off = times - mean_time
             skew = float(off @ (leads - mean_lead) / (off @ off))
             self.skew = min(max(skew, -LARGEST_SKEW), LARGEST_SKEW)
-        self._lead_us = base_us + mean_lead - self.skew * mean_time
+        self._lead_us = float(base_us + mean_lead - self.skew * mean_time)
 
 
 _TIMESYNC = reader("TIMESYNC", "tc1", "ts1", "target_system", "target_component")
