@@ -10,8 +10,10 @@ from pymavlink.dialects.v20 import all as public
 from streams import KEY, ROOT, STOCK, codec, made, message, parsed, payloads, seeded
 from wire import frame
 
+from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import Frame, encode
 from risaf_link.mavlink.peers import Terms
+from risaf_link.mavlink.requests import Requests
 from risaf_link.mavlink.signing import (
     LATEST,
     MOST_STREAMS,
@@ -311,6 +313,23 @@ def test_no_key_is_set_in_flight_and_none_that_is_zero():
         "signing key refused: the vehicle is armed"
     ]
     assert signing.accepts(signed(10))
+
+
+FUZZED = ["SETUP_SIGNING", "COMMAND_ACK", "TIMESYNC", "HEARTBEAT", "DEBUG_FLOAT_ARRAY"]
+
+
+@given(st.lists(st.tuples(st.sampled_from(FUZZED), st.binary(max_size=255)), max_size=20))
+def test_no_content_is_too_strange(contents):
+    signing = link(setup=True, accept_unsigned=True)
+    net = Network(links={"ground": Terms(signing=signing)}, requests=Requests({"ground": None}))
+    for name, payload in contents:
+        raw = encode(IDS[name], payload, 0, OWN[0], 1)
+        ((received,), _) = parsed([raw])
+        assert signing.accepts(received)
+        net.component.receive(received, NEAR, net.now_us)
+        net.now_us += 5_000_000
+        net.component.advance(net.now_us, net.now_us)
+        net.component.collect(net.peers)
 
 
 def test_the_key_that_is_in_use_set_again_forgets_no_stream():

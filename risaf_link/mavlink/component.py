@@ -151,7 +151,8 @@ class Component:
         self._received_us = received_us
         self._requests.hear(frame, peer, own)
         if frame.message_id == TIMESYNC:
-            self._answer_timesync(frame, peer)
+            answer = timesync.answer_to(frame, own, lambda: self._estimator.now_us(received_us))
+            self._outbox += [(peer, "TIMESYNC", answer)] if answer else []
         if frame.message_id not in ORDERS or (frame.system, frame.component) == own:
             return
         if self._identity.hear(frame, received_us):
@@ -161,8 +162,8 @@ class Component:
         order = order_in(frame, peer)
         if order:
             self._obey(order)
-        for answer in self._tuning.take(frame, own, peer):
-            self._post(answer, peer)
+        for told in self._tuning.take(frame, own, peer):
+            self._post(told, peer)
         if self._parameters.tuned is not self._tuned:
             self._take_effect()
 
@@ -263,16 +264,6 @@ class Component:
         self._estimator.configure(self._tuned)
         if self._tuned.emit != before.emit:
             self._peers.set_defaults(self._tuned.emit)
-
-    def _answer_timesync(self, frame: Frame, peer: Peer) -> None:
-        """Tell the time of our stamps to who asks for it."""
-        asked = timesync.timesync_in(frame)
-        system, component = self._identity.own
-        for_us = asked.to[0] in {0, system} and asked.to[1] in {0, component}
-        if asked.tc1 == 0 and for_us and (frame.system, frame.component) != self._identity.own:
-            clock_us = self._estimator.now_us(self._received_us)
-            fields = timesync.answer(asked, (frame.system, frame.component), clock_us)
-            self._outbox.append((peer, "TIMESYNC", fields))
 
     def _set_up_signing(self, frame: Frame, peer: Peer) -> None:
         """Take another key, if it is for us alone and the link is one that may set it."""

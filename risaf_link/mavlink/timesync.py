@@ -12,6 +12,7 @@ https://mavlink.io/en/services/timesync.html
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -59,10 +60,16 @@ def request(now_us: int, component: int) -> dict[str, Any]:
     return {"tc1": 0, "ts1": now_us * 1000 + component, "target_system": 0, "target_component": 0}
 
 
-def answer(asked: Timesync, asker: tuple[int, int], clock_us: int) -> dict[str, Any]:
-    """Fields of the answer, by a clock that shows so much."""
+def answer_to(
+    frame: Frame, own: tuple[int, int], clock_us: Callable[[], int]
+) -> dict[str, Any] | None:
+    """Fields of the answer to a frame, by a clock of ours; None: it is not for us to answer."""
+    asked, asker = timesync_in(frame), (frame.system, frame.component)
+    for_us = asked.to[0] in {0, own[0]} and asked.to[1] in {0, own[1]}
+    if asked.tc1 != 0 or not for_us or asker == own:
+        return None
     return {
-        "tc1": max(clock_us, 1) * 1000,
+        "tc1": max(clock_us(), 1) * 1000,
         "ts1": asked.ts1,
         "target_system": asker[0],
         "target_component": asker[1],
