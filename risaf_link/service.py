@@ -12,6 +12,7 @@ from typing import Any
 
 from risaf_link.config import Config, load_calibration
 from risaf_link.core.estimate import Estimate
+from risaf_link.core.kernel import BUILT
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.links import Link, TlogLink, open_link
 from risaf_link.mavlink.commands import Peer
@@ -41,6 +42,16 @@ async def until_told(work: Coroutine[Any, Any, None]) -> None:
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     with suppress(asyncio.CancelledError):
         await task
+
+
+def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
+    """Choose the event loop: uvloop's where it is installed, which costs less a datagram."""
+    try:
+        from uvloop import new_event_loop
+    except ImportError:
+        return None
+    made: Callable[[], asyncio.AbstractEventLoop] = new_event_loop
+    return made
 
 
 class Service:
@@ -97,7 +108,10 @@ class Service:
 
     async def run(self) -> None:
         """Run until cancelled."""
-        _log.info("started: %s", ", ".join(link.name for link in self.links) or "no links")
+        kernel = "kernel" if BUILT else "no kernel: NumPy alone"
+        loop = type(asyncio.get_running_loop()).__module__.partition(".")[0]
+        names = ", ".join(link.name for link in self.links) or "no links"
+        _log.info("started: %s (%s, %s)", names, kernel, loop)
         try:
             async with asyncio.TaskGroup() as tasks:
                 for link in self.links:

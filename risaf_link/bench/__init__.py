@@ -4,22 +4,19 @@ import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from risaf_link.bench import epoch, limits, live, reading
 from risaf_link.bench.extent import FULL, QUICK, Extent
 from risaf_link.bench.figure import Figure
 
-GROUPS = ("limits", "epoch", "replay", "log", "live", "start")
 
-
-def bench(
-    extent: Extent, groups: Collection[str] = GROUPS, log: Path | None = None
-) -> Iterator[Figure]:
+def bench(extent: Extent, groups: Collection[str], log: Path | None = None) -> Iterator[Figure]:
     """Measure.
 
     Parameters
     ----------
     extent : Extent
     groups : collection of str
-        Some of GROUPS.
+        Some of `limits`, `epoch`, `replay`, `log`, `live`, `start`.
     log : Path or None
         A mixed tlog; None: one is made.
 
@@ -28,8 +25,6 @@ def bench(
     Figure
         As soon as it is known.
     """
-    from risaf_link.bench import epoch, limits, live, reading
-
     if "limits" in groups:
         yield from limits.limits(extent)
     if "epoch" in groups:
@@ -48,4 +43,4 @@ def bench(
         yield from live.start(extent)
 
 
-__all__ = ["FULL", "GROUPS", "QUICK", "Extent", "Figure", "bench"]
+__all__ = ["FULL", "QUICK", "Extent", "Figure", "bench"]

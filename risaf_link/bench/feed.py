@@ -60,11 +60,10 @@ def bursts(scenario: Scenario, seconds: float) -> Iterator[Burst]:
 
 
 def _later(message: Message, shift_us: int, epochs: int) -> bytes:
-    if not shift_us or message.message_id not in STAMPED:
-        return message.payload
-    time_us, sequence, first = ARRAY_HEAD.unpack_from(message.payload)
-    time_us += shift_us
-    if message.message_id not in NUMBERED:
-        return time_us.to_bytes(8, "little") + message.payload[8:]
-    head = ARRAY_HEAD.pack(time_us, (sequence + epochs) & 0xFFFF, first)
-    return head + message.payload[ARRAY_HEAD.size :]
+    payload = bytearray(message.payload)
+    if shift_us and message.message_id in STAMPED:
+        time_us, sequence, first = ARRAY_HEAD.unpack_from(payload)
+        if message.message_id in NUMBERED:
+            sequence = (sequence + epochs) & 0xFFFF
+        ARRAY_HEAD.pack_into(payload, 0, time_us + shift_us, sequence, first)
+    return bytes(payload)

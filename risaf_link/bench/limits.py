@@ -1,13 +1,14 @@
 """What bounds all of it on this machine: bytes copied, bytes summed, numbers brought in order."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from fastcrc import crc16
 
 from risaf_link.bench.epoch import SEED
 from risaf_link.bench.extent import Extent
-from risaf_link.bench.figure import Figure, Spread, seconds_of, spread_of
+from risaf_link.bench.figure import Figure, Spread, seconds_of
 
 COPIED = 64 << 20  # bytes, more than the caches of most machines hold
 SUMMED = 4 << 20  # bytes
@@ -25,20 +26,21 @@ def limits(extent: Extent) -> Iterator[Figure]:
     yield _speed("limit_checksum", "checksum of bytes in one piece, fastcrc", SUMMED, taken)
     for sensors in (150, 300):
         values = np.random.default_rng(SEED).normal(size=(3, sensors))
-        low, high = sensors // 5, sensors - sensors // 5
+        quantiles = sensors // 5, sensors - sensors // 5
         for key, name, work in (
-            ("read", "summed", lambda v: v.sum(axis=1)),
-            ("select", "parted at two quantiles", lambda v: np.partition(v, (low, high))),
-            ("sort", "sorted", np.sort),
+            ("sum", "summed", partial(np.sum, values, axis=1)),
+            ("select", "parted at two quantiles", partial(np.partition, values, quantiles)),
+            ("sort", "sorted", partial(np.sort, values)),
         ):
-
-            def repeated(work: object = work, values: object = values) -> None:
-                for _ in range(CALLS):
-                    work(values)  # type: ignore[operator]
-
             text = f"3 x {sensors} numbers {name}, NumPy"
-            spread = spread_of(repeated, extent.repeats, 1e6 / CALLS)
+            taken = seconds_of(partial(_many, work), extent.repeats)
+            spread = Spread.of([seconds * 1e6 / CALLS for seconds in taken])
             yield Figure(f"limit_{key}_{sensors}", text, "us", spread)
+
+
+def _many(work: Callable[[], object]) -> None:
+    for _ in range(CALLS):
+        work()
 
 
 def _speed(key: str, text: str, size: int, taken: list[float]) -> Figure:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import quantiles
 
@@ -262,9 +263,9 @@ def _lost(key: str, text: str, course: Course) -> Figure:
 def start(extent: Extent) -> Iterator[Figure]:
     """From the command to the first HEARTBEAT, and to the end of --help."""
     heartbeat = Spread.of([_first_heartbeat_s() for _ in range(extent.runs)])
-    run = [[sys.executable, "-c", "pass"], [*COMMAND, "--help"]]
+    commands = [[sys.executable, "-c", "pass"], [*COMMAND, "--help"]]
     python, help_s = (
-        Spread.of(seconds_of(lambda c=command: _output(c), extent.runs)) for command in run
+        Spread.of(seconds_of(partial(_output, command), extent.runs)) for command in commands
     )
     against = "python -c pass"
     figure = "start", "start of the service to its first HEARTBEAT", "s", heartbeat
