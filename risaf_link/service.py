@@ -10,14 +10,19 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from risaf_link.config import Config, load_calibration
-from risaf_link.core.estimate import Estimate
+from risaf_link.core.estimate import EstimateBlock
+from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.kernel import BUILT
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.links import Link, TlogLink, open_link
+from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.commands import Peer
-from risaf_link.mavlink.component import Component
+from risaf_link.mavlink.component import ORDERS, Component
 from risaf_link.mavlink.frame import FrameParser
+from risaf_link.mavlink.held import Held
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.pipeline import Pipeline
@@ -97,6 +102,11 @@ class Service:
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
+        self._blocks = BlockReader(
+            self.pipeline.ingest, self.pipeline.assembler, apart=ORDERS, longest=1
+        )
+        self._held = Held()
+        self._holding: Peer = ("", "")  # whose datagrams wait
         self._frames = 0
         self._received_us = 0
         self._mismatch = ""
@@ -119,29 +129,51 @@ class Service:
                 try:
                     await self._beat()
                 finally:  # the links are still open
-                    for block in self.pipeline.flush(self._received_us):
-                        self._send(list(block))
+                    self._take_held()
+                    self._send(self.pipeline.flush(self._received_us))
         finally:
             counts = self.pipeline.assembler.counts
             _log.info("ended: %d frames, %d epochs", self._frames, counts["epochs"])
 
     def _receive(self, link: Link, data: bytes, peer: str) -> None:
         """Take what came over a link, and send what comes of it."""
+        sender = link.name, peer
+        if sender != self._holding:
+            self._take_held()
+            self._holding = sender
+        if not self._held.holds(data):
+            self._take(self._held.take(data), sender)
+            self._held.note_end(data, self._blocks.is_steady)
+
+    def _take_held(self) -> None:
+        """Take what waits, if anything does."""
+        if self._held:
+            self._take(self._held.take(), self._holding)
+
+    def _take(self, data: bytes, sender: Peer) -> None:
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
-        for frame in self._parser(link.name, peer).receive_data(data):
-            self._frames += 1
-            for recording in self._recordings:
-                recording.record(received_us, frame.raw)
-            self._component.receive(frame, (link.name, peer), received_us)
-            self._send(self.pipeline.step(frame, received_us))
+        table = self._parser(*sender).receive_table(data)
+        self._frames += len(table)
+        for recording in self._recordings:
+            for row in range(len(table)):
+                recording.record(received_us, table.frame(row).raw)
+        for item in self._blocks.read(table, np.full(len(table), received_us, np.uint64)):
+            if isinstance(item, EpochBlock):
+                self._send(self.pipeline.advance(item))
+            else:
+                frame, _ = item
+                self._component.receive(frame, sender, received_us)
+                self._send(self.pipeline.gather(frame, received_us))
+                self._send(self.pipeline.release())
         self._hand_out(self._component.collect(self._peers()))
         self._tell_mismatch()
 
-    def _send(self, estimates: list[Estimate]) -> None:
-        peers = list(self._peers()) if estimates else []
-        for estimate in estimates:
-            self._component.observe(estimate)
-            self._hand_out(self._component.emit(estimate, peers))
+    def _send(self, blocks: list[EstimateBlock]) -> None:
+        for block in blocks:
+            peers = list(self._peers())
+            for estimate in block:
+                self._component.observe(estimate)
+                self._hand_out(self._component.emit(estimate, peers))
 
     def _peers(self) -> Iterator[Peer]:
         return ((link.name, peer) for link in self.links for peer in link.peers)
@@ -179,6 +211,7 @@ class Service:
         """Do what is due by time; HEARTBEAT follows the estimator's progress."""
         loop = asyncio.get_running_loop()
         while True:
+            self._take_held()
             self._component.advance(round(loop.time() * 1e6))
             self._hand_out(self._component.collect(self._peers()))
             await asyncio.sleep(TICK_S)
