@@ -28,6 +28,7 @@ from risaf_link.mavlink.parameters import Parameters
 from risaf_link.pipeline import Pipeline
 
 TICK_S = 0.1  # from one look at what is due by time to the next
+OPENING_S = 0.005  # from one look at whether the links are open to the next, at the start
 MOST_PEERS = 256  # of all links together
 PARAM_VALUE_BYTES = 37  # of a PARAM_VALUE frame
 PARAMETERS_SHARE = 0.4  # of a link, that a list of parameters takes at most
@@ -208,8 +209,14 @@ class Service:
                 _log.error("no estimates: array.calibration: %s", self._mismatch)
 
     async def _beat(self) -> None:
-        """Do what is due by time; HEARTBEAT follows the estimator's progress."""
+        """Do what is due by time; HEARTBEAT follows the estimator's progress.
+
+        The first one must not go out before the links that open at once are open.
+        """
         loop = asyncio.get_running_loop()
+        opened_s = loop.time() + TICK_S
+        while loop.time() < opened_s and not all(link.counts.connections for link in self.links):
+            await asyncio.sleep(OPENING_S)
         while True:
             self._take_held()
             self._component.advance(round(loop.time() * 1e6))

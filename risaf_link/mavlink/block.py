@@ -109,6 +109,8 @@ class BlockReader:
             block = self._block(table, times_us, most)
             if block is not None:
                 yield block
+                if block.row[-1] == len(table) - 1:
+                    return
                 if len(block) == most:
                     continue
             row = self._finder.single()
