@@ -1,12 +1,13 @@
 """The daemon: links on one side, the pipeline on the other, and nothing between that waits."""
 
 import asyncio
+import gc
 import logging
 import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -28,7 +29,7 @@ from risaf_link.mavlink.parameters import Parameters
 from risaf_link.pipeline import Pipeline
 
 TICK_S = 0.1  # from one look at what is due by time to the next
-OPENING_S = 0.005  # from one look at whether the links are open to the next, at the start
+OPENING = 20  # looks at whether the links are open, in the first TICK_S
 MOST_PEERS = 256  # of all links together
 PARAM_VALUE_BYTES = 37  # of a PARAM_VALUE frame
 PARAMETERS_SHARE = 0.4  # of a link, that a list of parameters takes at most
@@ -58,6 +59,21 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
         return None
     made: Callable[[], asyncio.AbstractEventLoop] = new_event_loop
     return made
+
+
+@contextmanager
+def settled() -> Iterator[None]:
+    """Let the garbage collector pass over all that is there by now.
+
+    To look through it takes 10 ms, in which an epoch would wait; what comes and goes with each
+    epoch is looked through in microseconds.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 class Service:
@@ -214,9 +230,10 @@ class Service:
         The first one must not go out before the links that open at once are open.
         """
         loop = asyncio.get_running_loop()
-        opened_s = loop.time() + TICK_S
-        while loop.time() < opened_s and not all(link.counts.connections for link in self.links):
-            await asyncio.sleep(OPENING_S)
+        for _ in range(OPENING):
+            if all(link.counts.connections for link in self.links):
+                break
+            await asyncio.sleep(TICK_S / OPENING)
         while True:
             self._take_held()
             self._component.advance(round(loop.time() * 1e6))

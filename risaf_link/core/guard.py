@@ -338,7 +338,9 @@ class HeadingGuard:
 
     def _turned_before(self, age: float) -> Floats:
         """The rate's integral `age` seconds ago, and that time; the oldest known, at most."""
-        i = np.searchsorted(self._turned[: self._turns, 3], self._elapsed - age + 1e-9, side="right")
+        i = np.searchsorted(
+            self._turned[: self._turns, 3], self._elapsed - age + 1e-9, side="right"
+        )
         entry: Floats = self._turned[max(int(i) - 1, 0)]
         return entry
 
