@@ -3,8 +3,8 @@
     pip install .[plot]
     python benchmarks/scaling.py --out scaling.png
 
-The lines are fits through the origin's neighbourhood: a fixed cost and one for each sensor or
-second. Printed beside them: the exponent between the last points, 1 where the cost is a line.
+The lines are a fixed cost and one for each sensor, or second, fitted to relative errors. Printed
+beside them: the exponent at the end, 1 where the cost is a line.
 """
 
 import argparse
