@@ -49,7 +49,7 @@ def replay_s(path: Path, method: str) -> float:
     """Seconds of a replay, Python's start not counted: the best of three."""
     setting = f"fusion.method={method}"
     command = [sys.executable, "-m", "risaf_link.cli", "replay", path, "--json", "--set", setting]
-    found = [json.loads(subprocess.run(command, check=True, stdout=-1).stdout) for _ in range(3)]
+    found = [json.loads(subprocess.run(command, check=True, stdout=-1).stdout) for _ in range(3)]  # noqa: S603
     return min(each["duration_s"] / each["realtime_factor"] for each in found)
 
 

@@ -10,7 +10,7 @@ order, the one that came last before is taken as it comes, and with it the epoch
 """
 
 from risaf_link.mavlink.dialect import IDS
-from risaf_link.mavlink.frame import CHECKSUM, HEADERS, MARK_V2
+from risaf_link.mavlink.search import CHECKSUM, HEADERS, MARK_V2
 
 MOST_HELD = 64  # datagrams
 READINGS = {IDS[name].to_bytes(3, "little") for name in ("GYRO_ARRAY", "ACCEL_ARRAY")}
