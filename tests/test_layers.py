@@ -15,7 +15,7 @@ LAYERS = [
     {"config", "sweep"},
     {"kept"},
     {"service", "replay", "survey", "calibrate", "experiments"},
-    {"fleet", "words"},
+    {"fleet", "words", "bench"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -96,7 +96,8 @@ class VehicleClock:
 
     def boot_times(self, time_us: Times, received_us: Times) -> Times:
         """Do what `boot_us` does, for k epochs that were received one after another."""
-        leads_us = self._array.note_steady(time_us, received_us)
+        several = len(time_us) > 1
+        leads_us = self._array.note_steady(time_us, received_us) if several else None
         if leads_us is None:
             pairs = zip(time_us.tolist(), received_us.tolist(), strict=True)
             return np.array([self.boot_us(*pair) for pair in pairs])
