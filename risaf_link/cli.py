@@ -19,6 +19,8 @@ if TYPE_CHECKING:  # what a command needs is imported when it runs: help must co
     from risaf_link.publish.plot import HeadingPlot
     from risaf_link.replay import Replay
 
+GROUPS = ("limits", "epoch", "replay", "log", "live", "start")  # of `bench`
+
 EXIT_STATUS: dict[type[RisafError], int] = {ConfigError: 2, LinkError: 2, LogError: 3}
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -107,8 +109,19 @@ def _selected(command: Command) -> Command:
     return start(end(command))
 
 
+def _tell_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    """Tell the version, and whether the kernel was built: it need not be imported for that."""
+    if not wanted:
+        return
+    from importlib.util import find_spec
+
+    kernel = "kernel built" if find_spec("risaf_link.core._kernel") else "no kernel, NumPy alone"
+    click.echo(f"risaf-link, version {__version__} ({kernel})")
+    ctx.exit()
+
+
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="risaf-link")
+@click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_tell_version)
 def main() -> None:
     """One trustworthy attitude and heading from an array of cheap MEMS gyros, over MAVLink.
 
@@ -136,13 +149,14 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
 
     from risaf_link.config import load
     from risaf_link.kept import kept_parameters
-    from risaf_link.service import Service, until_told
+    from risaf_link.service import Service, loop_factory, settled, until_told
 
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(levelname)s %(message)s")
     config = load(config_path, settings)
     service = Service(config, kept_parameters(config, config_path, settings))
-    asyncio.run(until_told(service.run()))
+    with settled(), asyncio.Runner(loop_factory=loop_factory()) as runner:
+        runner.run(until_told(service.run()))
 
 
 @main.command()
@@ -362,6 +376,67 @@ def experiment(name: str, out: Path, **options: Any) -> None:
 
     for section in perform(name, out, **options):
         click.echo(out / f"{section.name}.png")
+
+
+@main.command()
+@click.option("--quick", is_flag=True, help="Minutes become seconds; the figures spread more.")
+@click.option(
+    "--only",
+    "groups",
+    type=click.Choice(GROUPS),
+    multiple=True,
+    help="One kind of figures: what bounds them all, epochs, replays, logs of autopilots, the live "
+    "service, its start. Repeatable.",
+)
+@click.option(
+    "--log",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="LOG.tlog",
+    help="A log of an autopilot to read, in place of one that is made.",
+)
+@click.option(
+    "--minutes",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="N",
+    help="How long 300 gyros are sent at 1 kHz.  [default: 20 s]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def bench(
+    quick: bool, groups: tuple[str, ...], log: Path | None, minutes: float | None, as_json: bool
+) -> None:
+    """Measure how fast it is on this machine, beside what else there is.
+
+    Every figure has a reference that was measured in the same run: the NumPy form, pymavlink and,
+    where they are installed (the extra `bench`), imufusion, vqf and fasttlogparser. Nothing leaves
+    127.0.0.1. The live service is measured on Linux.
+
+    \b
+    risaf-link bench
+    risaf-link bench --quick --only live --json
+    risaf-link bench --only live --minutes 10
+    """
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from risaf_link.bench import FULL, QUICK
+    from risaf_link.bench import bench as measure
+    from risaf_link.bench.machine import machine
+    from risaf_link.bench.table import as_object, show
+
+    extent = QUICK if quick else FULL
+    if minutes:
+        extent = replace(extent, fast_s=60.0 * minutes)
+    where = machine()
+    figures = []
+    with Console(stderr=True).status("measuring") as status:
+        for figure in measure(extent, groups or GROUPS, log):
+            status.update(figure.text)
+            figures.append(figure)
+    if as_json:
+        click.echo(json.dumps(as_object(where, figures)))
+    else:
+        show(where, figures, Console())
 
 
 @main.command("check-config")

@@ -1,23 +1,30 @@
 """The daemon: links on one side, the pipeline on the other, and nothing between that waits."""
 
 import asyncio
+import gc
 import logging
 import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from risaf_link.config import Config, load_calibration
-from risaf_link.core.estimate import Estimate
+from risaf_link.core.estimate import EstimateBlock
+from risaf_link.core.fusion import EpochBlock
+from risaf_link.core.kernel import BUILT
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.keys import open_keys
 from risaf_link.links import Link, TlogLink, open_link
+from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.commands import Peer
-from risaf_link.mavlink.component import Component
-from risaf_link.mavlink.frame import Frame, FrameParser
+from risaf_link.mavlink.component import HEARD, Component
+from risaf_link.mavlink.frame import FrameParser, FrameTable
+from risaf_link.mavlink.held import Held
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.peers import Terms
@@ -26,6 +33,7 @@ from risaf_link.mavlink.signing import SETUP_SIGNING, Rejection
 from risaf_link.pipeline import Pipeline
 
 TICK_S = 0.1  # from one look at what is due by time to the next
+OPENING = 20  # looks at whether the links are open, in the first TICK_S
 MOST_PEERS = 256  # of all links together
 PARAM_VALUE_BYTES = 37  # of a PARAM_VALUE frame
 PARAMETERS_SHARE = 0.4  # of a link, that a list of parameters takes at most
@@ -46,6 +54,31 @@ async def until_told(work: Coroutine[Any, Any, None]) -> None:
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     with suppress(asyncio.CancelledError):
         await task
+
+
+def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
+    """Choose the event loop: uvloop's where it is installed, which costs less a datagram."""
+    try:
+        from uvloop import new_event_loop
+    except ImportError:
+        return None
+    made: Callable[[], asyncio.AbstractEventLoop] = new_event_loop
+    return made
+
+
+@contextmanager
+def settled() -> Iterator[None]:
+    """Let the garbage collector pass over all that is there by now.
+
+    To look through it takes 10 ms, in which an epoch would wait; what comes and goes with each
+    epoch is looked through in microseconds.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 class Service:
@@ -102,6 +135,11 @@ class Service:
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
+        self._blocks = BlockReader(
+            self.pipeline.ingest, self.pipeline.assembler, apart=HEARD, longest=1
+        )
+        self._held = Held()
+        self._holding: Peer = ("", "")  # whose datagrams wait
         self._frames = 0
         self._received_us = 0
         self._mismatch = ""
@@ -126,7 +164,10 @@ class Service:
         """
         self._keys.advance(self._clock_us())
         self._keys.open()
-        _log.info("started: %s", ", ".join(link.name for link in self.links) or "no links")
+        kernel = "kernel" if BUILT else "no kernel: NumPy alone"
+        loop = type(asyncio.get_running_loop()).__module__.partition(".")[0]
+        names = ", ".join(link.name for link in self.links) or "no links"
+        _log.info("started: %s (%s, %s)", names, kernel, loop)
         try:
             async with asyncio.TaskGroup() as tasks:
                 for link in self.links:
@@ -134,8 +175,8 @@ class Service:
                 try:
                     await self._beat()
                 finally:  # the links are still open
-                    for block in self.pipeline.flush(self._received_us):
-                        self._send(list(block))
+                    self._take_held()
+                    self._send(self.pipeline.flush(self._received_us))
         finally:
             self._keys.close()
             counts = self.pipeline.assembler.counts
@@ -143,30 +184,60 @@ class Service:
 
     def _receive(self, link: Link, data: bytes, peer: str) -> None:
         """Take what came over a link, and send what comes of it."""
+        sender = link.name, peer
+        if sender != self._holding:
+            self._take_held()
+            self._holding = sender
+        if not self._held.holds(data):
+            self._take(self._held.take(data), sender)
+            self._held.note_end(data, self._blocks.is_steady)
+
+    def _take_held(self) -> None:
+        """Take what waits, if anything does."""
+        if self._held:
+            self._take(self._held.take(), self._holding)
+
+    def _take(self, data: bytes, sender: Peer) -> None:
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
         self._keys.advance(received_us)
-        signing = self._keys.links.get(link.name)
-        for frame in self._parser(link.name, peer).receive_data(data):
-            if signing and not signing.accepts(frame):
-                continue
-            self._frames += 1
-            self._record(frame, received_us)
-            self._component.receive(frame, (link.name, peer), received_us)
-            self._send(self.pipeline.step(frame, received_us))
+        table = self._accepted(self._parser(*sender).receive_table(data), sender[0])
+        self._frames += len(table)
+        self._record(table, received_us)
+        self._component.note_traffic(table, sender)
+        for item in self._blocks.read(table, np.full(len(table), received_us, np.uint64)):
+            if isinstance(item, EpochBlock):
+                self._send(self.pipeline.advance(item))
+            else:
+                frame, _ = item
+                self._component.receive(frame, sender, received_us)
+                self._send(self.pipeline.gather(frame, received_us))
+                self._send(self.pipeline.release())
         self._hand_out(self._component.collect(self._peers()))
         self._tell_mismatch()
 
-    def _record(self, frame: Frame, received_us: int) -> None:
-        """Record what was taken, but for keys."""
-        if frame.message_id != SETUP_SIGNING:
-            for recording in self._recordings:
-                recording.record(received_us, frame.raw)
+    def _accepted(self, table: FrameTable, link: str) -> FrameTable:
+        """Those frames that the link's signing takes."""
+        signing = self._keys.links.get(link)
+        if signing is None:
+            return table
+        taken = [signing.accepts(table.frame(row)) for row in range(len(table))]
+        return FrameTable(table.buffer, table.cuts[np.array(taken, bool)])
 
-    def _send(self, estimates: list[Estimate]) -> None:
-        peers = list(self._peers()) if estimates else []
-        for estimate in estimates:
-            self._component.observe(estimate)
-            self._hand_out(self._component.emit(estimate, peers))
+    def _record(self, table: FrameTable, received_us: int) -> None:
+        """Record what was taken, but for keys."""
+        if not self._recordings:
+            return
+        for row in np.flatnonzero(table.cuts["message_id"] != SETUP_SIGNING).tolist():
+            raw = table.frame(row).raw
+            for recording in self._recordings:
+                recording.record(received_us, raw)
+
+    def _send(self, blocks: list[EstimateBlock]) -> None:
+        for block in blocks:
+            peers = list(self._peers())
+            for estimate in block:
+                self._component.observe(estimate)
+                self._hand_out(self._component.emit(estimate, peers))
 
     def _peers(self) -> Iterator[Peer]:
         return ((link.name, peer) for link in self.links for peer in link.peers)
@@ -219,9 +290,17 @@ class Service:
                 _log.error("no estimates: array.calibration: %s", self._mismatch)
 
     async def _beat(self) -> None:
-        """Do what is due by time; HEARTBEAT follows the estimator's progress."""
+        """Do what is due by time; HEARTBEAT follows the estimator's progress.
+
+        The first one must not go out before the links that open at once are open.
+        """
         loop = asyncio.get_running_loop()
+        for _ in range(OPENING):
+            if all(link.counts.connections for link in self.links):
+                break
+            await asyncio.sleep(TICK_S / OPENING)
         while True:
+            self._take_held()
             self._look_after_keys(loop.time())
             self._component.advance(round(loop.time() * 1e6), self._clock_us())
             self._hand_out(self._component.collect(self._peers()))

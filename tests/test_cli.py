@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 
 from risaf_link import __version__
 from risaf_link.cli import main
+from risaf_link.core.kernel import BUILT
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import encode
 from risaf_link.mavlink.tlog import record
@@ -34,11 +35,12 @@ def assert_one_line(result: Result, status: int, *parts: str) -> None:
 
 
 def test_version():
-    assert call("--version").stdout == f"risaf-link, version {__version__}\n"
+    kernel = "kernel built" if BUILT else "no kernel, NumPy alone"
+    assert call("--version").stdout == f"risaf-link, version {__version__} ({kernel})\n"
 
 
 @pytest.mark.parametrize(
-    "command", ["run", "replay", "simulate", "inspect", "calibrate", "check-config"]
+    "command", ["run", "replay", "simulate", "inspect", "calibrate", "check-config", "bench"]
 )
 def test_every_command_has_help_with_an_example(command):
     result = call(command, "--help")

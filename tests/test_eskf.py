@@ -229,11 +229,22 @@ def test_a_late_heading_is_compared_with_the_yaw_of_its_own_time():
             assert correction.outcome is Outcome.FUSED
 
 
-def test_a_heading_later_than_the_history_is_compared_with_its_oldest_yaw():
+def test_a_heading_older_than_the_history_is_compared_with_yaw_half_a_second_before_it_at_most():
     estimator = aligned_filter()
     run(estimator, 1.0, (0.0, 0.0, 0.1))
     correction = estimator.correct_heading(0.0, 0.02**2, 100.0, GATE)
-    assert abs(correction.value) < 0.01
+    assert correction.value == pytest.approx(0.05, abs=0.01)
+
+
+def test_a_first_heading_older_than_the_filter_sets_the_yaw_of_now():
+    """And in a turn that goes on like that, nothing is taken for a delay."""
+    estimator, delay, rate = level_filter(), 0.11, 0.2
+    for step in range(1, 3000):
+        run(estimator, DT, (0.0, 0.0, rate))
+        if step % 20 == 5:
+            estimator.correct_heading(wrap(rate * (step * DT - delay)), 0.01**2, delay, GATE)
+            error = wrap(estimator.state(0).euler[2] - rate * step * DT)
+            assert abs(error) < math.radians(0.1)
 
 
 def jump(estimator, angle, seconds, at_rest):

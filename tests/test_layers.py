@@ -16,7 +16,7 @@ LAYERS = [
     {"kept"},
     {"keys"},
     {"service", "replay", "survey", "calibrate", "experiments"},
-    {"fleet", "words"},
+    {"fleet", "words", "bench"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -7,6 +7,7 @@ from network import FAR, NEAR, OWN, Network, of
 from pymavlink.dialects.v20 import all as public
 from wire import AUTOPILOT, debug_array, frame, imu, info
 
+from risaf_link.mavlink.frame import FrameParser
 from risaf_link.mavlink.requests import Requests
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)
@@ -74,6 +75,8 @@ class Vehicle:
         for _ in range(round(seconds * 10)):
             arriving = self.autopilot.frames(0.1) + self.others
             for peer in self.peers:
+                table = FrameParser().receive_table(b"".join(each.raw for each in arriving))
+                self.net.component.note_traffic(table, peer)
                 for each in arriving:
                     self.net.component.receive(each, peer, self.net.now_us)
             for peer, messages in self.net.wait(0.1).items():

@@ -594,7 +594,7 @@ class Eskf:
         return wrap(turned) / (since - until)
 
     def _attitude_before(self, age: float) -> Quaternion:
-        """Attitude of `age` seconds ago, as known now; the oldest where that is too long ago."""
+        """Attitude of `age` seconds ago, as known now; before the oldest by the present rate."""
         time = self._elapsed - age
         later: tuple[float, Quaternion] | None = None
         for earlier in reversed(self._history):
@@ -602,7 +602,11 @@ class Eskf:
                 break
             later = earlier
         else:
-            earlier = later or (time, self._by_rate)
+            later_s, by_rate = later or (self._elapsed, self._by_rate)
+            missing = min(later_s - time, LONG_STEP)
+            x, y, z = (self._rate * -missing).tolist()
+            before = quaternion.product(by_rate, quaternion.exp((x, y, z)))
+            return quaternion.product(self._correction, before)
         by_rate = earlier[1]
         if later and later[0] > earlier[0]:
             part = (time - earlier[0]) / (later[0] - earlier[0])

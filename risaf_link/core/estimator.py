@@ -127,7 +127,10 @@ class Estimator:
             track = Track.of([self._step(Epoch(0, *step, 0)) for step in steps])
         else:
             track = Track(values)
-        elapsed: Floats = np.concatenate(((self.elapsed,), dt)).cumsum()[1:]
+        elapsed: Floats = dt.copy()
+        elapsed[0] += self.elapsed
+        if len(dt) > 1:
+            elapsed.cumsum(out=elapsed)
         self.elapsed = float(elapsed[-1])
         self._guard.advance(track, elapsed, dt)
         return track, elapsed

@@ -6,8 +6,6 @@ turns round at speed is no change of gear. And what the accelerometer feels alon
 the change of speed, with the gear's sign.
 """
 
-import numpy as np
-
 from risaf_link.core.rotation import Floats
 
 STANDING_SPEED = 0.5  # m/s; GPS shows half of it where nothing moves
@@ -43,13 +41,11 @@ class Gear:
 
     def feel(self, ahead: Floats, dt: Floats) -> None:
         """Use what k epochs felt ahead, (k,) m/s^2; NaN: there is no accelerometer."""
-        felt = np.abs(ahead) < LARGEST_FORCE
-        if felt.all():
-            gained = ahead * dt
-        else:
-            gained, self._begun = np.where(felt, ahead * dt, 0.0), None
-        for gain in gained.tolist():
-            self._felt += gain
+        for force, seconds in zip(ahead.tolist(), dt.tolist(), strict=True):
+            if abs(force) < LARGEST_FORCE:
+                self._felt += force * seconds
+            else:
+                self._begun = None
 
     def hear(self, speed: float, speed_std: float, time_s: float) -> None:
         """Use a speed over ground, m/s, with its standard deviation."""

@@ -38,6 +38,7 @@ LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
 AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
 RATES = 1024  # epochs; a second at 1 kHz
+ROOM = 4 * RATES  # so that room has to be made only now and then
 RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
 
 Estimator = Eskf | PaperFilter
@@ -163,7 +164,8 @@ class HeadingGuard:
         self._dispute = Dispute(LONGEST_DEFENCE * parameters.reset_after)
         self._elapsed = 0.0  # s
         self._last = -math.inf  # s, when the last heading came
-        self._turned = np.zeros((1, 4))  # rad, the rate's integral in body axes; s
+        self._turned = np.zeros((ROOM, 4))  # rad, the rate's integral in body axes; s
+        self._turns = 1  # how many of them are known
         self._aligned = False
         self._confirmed = 0.0  # s for which headings have agreed with yaw
 
@@ -177,15 +179,29 @@ class HeadingGuard:
 
         The track is given the doubt about yaw that headings have left, which no filter knows of.
         """
-        turns = np.vstack((self._turned[-1, :3], track.rate_b * dt[:, np.newaxis]))
-        fresh = np.column_stack((turns.cumsum(axis=0)[1:], elapsed))
-        self._turned = np.vstack((self._turned[-RATES:], fresh))
+        self._turn(track.rate_b, elapsed, dt)
         self._elapsed = float(elapsed[-1])
         self._aligned = bool(track.aligned[-1])
         self.gear.feel(track.ahead, dt)
         if self._whiteness.doubt:
             doubted = np.hypot(track.yaw_std, self._whiteness.doubt)
             track.yaw_std[:] = np.minimum(doubted, math.pi)
+
+    def _turn(self, rate_b: Floats, elapsed: Floats, dt: Floats) -> None:
+        """Go on with the rate's integral."""
+        if self._turns + len(dt) > len(self._turned):
+            kept = self._turned[max(self._turns - RATES, 0) : self._turns]
+            self._turned = np.empty((ROOM + len(dt), 4))
+            self._turned[: len(kept)] = kept
+            self._turns = len(kept)
+        last, fresh = self._turned[self._turns - 1], self._turned[self._turns :][: len(dt)]
+        turns = fresh[:, :3]
+        np.multiply(rate_b, dt[:, np.newaxis], out=turns)
+        turns[0] += last[:3]
+        if len(dt) > 1:
+            np.cumsum(turns, axis=0, out=turns)
+        fresh[:, 3] = elapsed
+        self._turns += len(dt)
 
     def take(self, estimator: Estimator, motion: Motion) -> Innovation | None:
         """Use what one fix says; None: it says nothing of heading."""
@@ -322,7 +338,9 @@ class HeadingGuard:
 
     def _turned_before(self, age: float) -> Floats:
         """The rate's integral `age` seconds ago, and that time; the oldest known, at most."""
-        i = np.searchsorted(self._turned[:, 3], self._elapsed - age + 1e-9, side="right")
+        i = np.searchsorted(
+            self._turned[: self._turns, 3], self._elapsed - age + 1e-9, side="right"
+        )
         entry: Floats = self._turned[max(int(i) - 1, 0)]
         return entry
 

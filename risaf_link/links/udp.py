@@ -3,6 +3,7 @@
 import asyncio
 import errno
 import logging
+import os
 import socket
 import time
 from collections.abc import Callable
@@ -13,6 +14,9 @@ from risaf_link.links.link import BACKOFF, Backoff, Connection, Link
 MOST_PEERS = 32
 SILENCE_S = 60.0  # after which a peer is forgotten
 RECEIVE_BUFFER = 4 << 20  # bytes asked for; the system grants what net.core.rmem_max allows
+
+MOST_AT_ONCE = 64  # datagrams, before other links have their turn
+LARGEST = 65536  # bytes of a datagram
 
 _log = logging.getLogger(__name__)
 
@@ -41,12 +45,31 @@ class _Datagrams(Endpoint, asyncio.DatagramProtocol):
         super().connection_made(transport)
         udp: socket.socket = transport.get_extra_info("socket")
         udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        self._socket = socket.socket(fileno=os.dup(udp.fileno()))
+        self._socket.setblocking(False)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._socket.close()
+        super().connection_lost(error)
 
     def send(self, data: bytes, address: Address | None = None) -> None:
         if self._takes(data):
             self._transport.sendto(data, address)
 
     def datagram_received(self, data: bytes, address: Address) -> None:
+        """Take a datagram, and those that have come behind it: the loop would give one a turn."""
+        self._deliver(data, address)
+        for _ in range(MOST_AT_ONCE):
+            try:
+                data, address = self._socket.recvfrom(LARGEST)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self.error_received(error)
+                return
+            self._deliver(data, address)
+
+    def _deliver(self, data: bytes, address: Address) -> None:
         if data:
             self._connection.deliver(data, self._heard(address))
 

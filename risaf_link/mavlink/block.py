@@ -19,7 +19,14 @@ import numpy as np
 
 from risaf_link.mavlink.choice import PATIENCE_US
 from risaf_link.mavlink.dialect import IDS
-from risaf_link.mavlink.epoch import JUMP_US, EpochAssembler, GyroChunk, RegularEpochs, Source
+from risaf_link.mavlink.epoch import (
+    JUMP_US,
+    REVIEW,
+    EpochAssembler,
+    GyroChunk,
+    RegularEpochs,
+    Source,
+)
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.gps import READERS
 from risaf_link.mavlink.ingest import NONE, ArrayInfo, Ingest
@@ -55,12 +62,19 @@ class BlockReader:
         Of the pipeline: blocks are taken here, what comes alone is taken there.
     apart : collection of int
         Ids of messages that are not the pipeline's, and are to be handed on in their place as well.
+    longest : int
+        Epochs of a block, at most.
     """
 
     def __init__(
-        self, ingest: Ingest, assembler: EpochAssembler, apart: Collection[int] = ()
+        self,
+        ingest: Ingest,
+        assembler: EpochAssembler,
+        apart: Collection[int] = (),
+        longest: int = REVIEW,
     ) -> None:
         self._ingest, self._assembler = ingest, assembler
+        self._longest = longest
         self._kinds = _kinds(ingest, apart)
         self._layout: _kernel.ArrayLayout
         self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
@@ -91,10 +105,12 @@ class BlockReader:
             return
         self._finder.load(table.buffer, table.cuts.view(np.uint8), times_us)
         while True:
-            most = self._assembler.until_review
+            most = min(self._assembler.until_review, self._longest)
             block = self._block(table, times_us, most)
             if block is not None:
                 yield block
+                if block.row[-1] == len(table) - 1:
+                    return
                 if len(block) == most:
                     continue
             row = self._finder.single()
@@ -102,13 +118,23 @@ class BlockReader:
                 return
             yield table.frame(row), int(times_us[row])
 
+    @property
+    def is_steady(self) -> bool:
+        """Whether nothing waits, and the next epoch may be taken at once."""
+        source = self._assembler.source
+        return (
+            source is not None
+            and source == self._ingest.source
+            and self._assembler.is_steady(self._ingest.info_of_counts(source).sensors)
+        )
+
     def _block(self, table: FrameTable, times_us: Stamps, most: int) -> RegularEpochs | None:
         source, last = self._assembler.source, self._assembler.last
         if self._finder is None or source is None or last is None or last.sequence is None:
             return None
-        info = self._ingest.info_of_counts(source)
-        if source != self._ingest.source or not self._assembler.is_steady(info.sensors):
+        if not self.is_steady:
             return None
+        info = self._ingest.info_of_counts(source)
         self._lay_out(source, info)
         heard_us = self._ingest.heard_us
         found = self._finder.take(self._layout, last.time_us, last.sequence, heard_us, most)

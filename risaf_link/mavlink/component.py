@@ -18,7 +18,7 @@ from risaf_link.core.rotation import Floats
 from risaf_link.mavlink import timesync
 from risaf_link.mavlink.commands import Command, Order, Peer, Result, order_in, whole
 from risaf_link.mavlink.dialect import IDS, name_of
-from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.gyro_calibration import GyroCalibration, Report
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.notices import Notice, Notices, Severity, statustexts
@@ -30,11 +30,11 @@ from risaf_link.mavlink.signing import KEY_SIZE, SETUP_SIGNING, setup_in
 from risaf_link.mavlink.telemetry import heartbeat
 from risaf_link.mavlink.tuning import Answer, Tuning
 
-TIMESYNC = IDS["TIMESYNC"]
 CAPABILITIES = 8 | 16 | 8192
 """MAV_PROTOCOL_CAPABILITY: COMMAND_INT, PARAM_ENCODE_BYTEWISE (REAL32 is the same in both ways, and
 one must be told), MAVLINK2."""
 
+TIMESYNC = IDS["TIMESYNC"]
 ORDERS = frozenset(
     IDS[name]
     for name in (
@@ -43,6 +43,9 @@ ORDERS = frozenset(
     )
 )
 """Messages that may change what we do."""
+
+HEARD = ORDERS | {TIMESYNC, IDS["COMMAND_ACK"]}
+"""Messages that are read here."""
 
 
 class Estimator(Protocol):
@@ -166,6 +169,10 @@ class Component:
             self._post(told, peer)
         if self._parameters.tuned is not self._tuned:
             self._take_effect()
+
+    def note_traffic(self, table: FrameTable, peer: Peer) -> None:
+        """Take note of all that a peer sent, also of what is not handed to `receive`."""
+        self._requests.note_traffic(table, peer)
 
     def observe(self, estimate: Estimate) -> None:
         """Take the next estimate."""

@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from risaf_link.mavlink.commands import Command, Peer, Result
 from risaf_link.mavlink.dialect import IDS, MESSAGES, reader
-from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.frame import Frame, FrameTable
 
 Requested = Literal[
     "HIGHRES_IMU",
@@ -44,6 +44,7 @@ IMUS: tuple[tuple[Requested, ...], ...] = (
     ("SCALED_IMU3",),
 )
 
+GYRO_ARRAY = IDS["GYRO_ARRAY"]
 GROUND_STATION, NO_AUTOPILOT = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
 FRAME_BYTES = 12  # of a MAVLink 2 frame, around its payload
 SHARE = 0.5  # of a link, that all that is asked for may take
@@ -185,8 +186,21 @@ class Requests:
         self._now_us = self._next_timesync_us = 0
         self._array_us: int | None = None  # when an array was last heard
 
+    def note_traffic(self, table: FrameTable, peer: Peer) -> None:
+        """Take note of all that a peer sent: what counts is what arrives."""
+        ids = table.cuts["message_id"].tolist()
+        if GYRO_ARRAY in ids and "GYRO_ARRAY" in self._encodings:
+            self._array_us = self._now_us
+        if peer != self._at:
+            return
+        sender, needs = self._autopilots[peer].sender, self._autopilots[peer].needs
+        systems, components = table.cuts["system"].tolist(), table.cuts["component"].tolist()
+        for message_id, *whose in zip(ids, systems, components, strict=True):
+            for need in needs:
+                need.count += need.message_id == message_id and tuple(whose) == sender
+
     def hear(self, frame: Frame, peer: Peer, own: tuple[int, int]) -> None:
-        """Take a frame: what counts is what arrives.
+        """Take a frame that tells of an autopilot, or of an array that is not in our dialect.
 
         Parameters
         ----------
@@ -196,20 +210,16 @@ class Requests:
         own : tuple of int
             Our system and component id; the autopilot is that of our system.
         """
-        message_id = frame.message_id
-        if message_id in _ARRAYS:
+        if frame.message_id == IDS["DEBUG_FLOAT_ARRAY"]:
             self._hear_array(frame)
         elif frame.system != own[0] or peer[0] not in self._links:
             return
-        elif message_id == IDS["HEARTBEAT"]:
+        elif frame.message_id == IDS["HEARTBEAT"]:
             self._hear_heartbeat(frame, peer)
-        elif peer == self._at and frame.component == self._autopilots[peer].sender[1]:
+        elif peer == self._at and frame.message_id == IDS["COMMAND_ACK"]:
             autopilot = self._autopilots[peer]
-            if message_id == IDS["COMMAND_ACK"]:
+            if autopilot.sender == (frame.system, frame.component):
                 self._hear_answer(frame, autopilot, own)
-            for need in autopilot.needs:
-                if need.message_id == message_id:
-                    need.count += 1
 
     def advance(self, now_us: int) -> list[tuple[Peer, dict[str, Any]]]:
         """Let it be later, microseconds of a clock that does not jump; COMMAND_LONGs to be sent."""
@@ -238,9 +248,8 @@ class Requests:
         return self._at
 
     def _hear_array(self, frame: Frame) -> None:
-        name = "GYRO_ARRAY" if frame.message_id == IDS["GYRO_ARRAY"] else "DEBUG_FLOAT_ARRAY"
-        is_gyro = name == "GYRO_ARRAY" or _DEBUG(frame.payload)[0].rstrip(b"\0") == b"gyro"
-        if is_gyro and name in self._encodings:
+        is_gyro = _DEBUG(frame.payload)[0].rstrip(b"\0") == b"gyro"
+        if is_gyro and "DEBUG_FLOAT_ARRAY" in self._encodings:
             self._array_us = self._now_us
 
     def _hear_heartbeat(self, frame: Frame, peer: Peer) -> None:
@@ -319,6 +328,3 @@ class Requests:
 def _size(name: str) -> int:
     size: int = MESSAGES[IDS[name]].unpacker.size
     return FRAME_BYTES + size
-
-
-_ARRAYS = frozenset({IDS["GYRO_ARRAY"], IDS["DEBUG_FLOAT_ARRAY"]})

@@ -716,7 +716,7 @@ class Eskf {
     remembered_ = std::min(remembered_ + 1, history_.size());
   }
 
-  // Attitude of `age` seconds ago, as known now; the oldest where that is too long ago.
+  // Attitude of `age` seconds ago, as known now; before the oldest by the present rate.
   Quaternion attitude_before(double age) const {
     const double time = elapsed_ - age;
     const Instant* later = nullptr;
@@ -731,7 +731,10 @@ class Eskf {
       }
       later = &earlier;
     }
-    return product(correction_, later ? later->by_rate : by_rate_);
+    const Instant oldest = later ? *later : Instant{elapsed_, by_rate_};
+    const double missing = std::min(oldest.time - time, c.LONG_STEP);
+    const Quaternion back = exp({-rate_[0] * missing, -rate_[1] * missing, -rate_[2] * missing});
+    return product(correction_, product(oldest.by_rate, back));
   }
 
   FilterNumbers c;
