@@ -7,15 +7,31 @@ from pathlib import Path
 import msgspec
 import pytest
 import yaml
-from streams import KEY
-from test_service import Running, address_of, config_for, ground, until  # noqa: F401
+from streams import KEY, parsed
+from test_service import (
+    EPOCHS,
+    Running,
+    address_of,
+    bursts,
+    config_for,
+    feed,
+    ground,  # noqa: F401
+    until,
+)
 from test_signing import OTHER_KEY, setup, signed
 from wire import frame
 
 from risaf_link.config import Config, dump, load
 from risaf_link.errors import ConfigError
 from risaf_link.keys import open_keys
-from risaf_link.mavlink.signing import RESERVE, SigningState
+from risaf_link.mavlink.frame import encode
+from risaf_link.mavlink.signing import (
+    RESERVE,
+    LinkSigning,
+    SigningKey,
+    SigningParameters,
+    SigningState,
+)
 from risaf_link.mavlink.tlog import TlogReader
 from risaf_link.service import Service
 
@@ -205,3 +221,28 @@ async def test_what_is_rejected_is_neither_used_nor_recorded(ground, tmp_path): 
         }
     recorded = [one.frame.raw for one in TlogReader([recording.read_bytes()])]
     assert recorded == [good.raw]
+
+
+async def test_a_signed_array_is_taken_whole_and_an_unsigned_one_not_at_all(ground, tmp_path):  # noqa: F811
+    signing = {"key": str(key_file(tmp_path))}
+    whole = config_for(ground)
+    array, output = whole.links
+    parameters = SigningParameters(**signing)
+    whole = msgspec.structs.replace(
+        whole, links=(msgspec.structs.replace(array, signing=parameters), output)
+    )
+    async with Running(whole, up=2) as service:
+        unsigned = bursts(epochs=5)
+        for raw in (raw for burst in unsigned for raw in burst):
+            ground.transport.sendto(raw, address_of(service))
+        sender = LinkSigning(SigningKey(KEY, stored(Path(signing["key"]))), 9, parameters)
+        signed_bursts = [[resigned(raw, sender) for raw in burst] for burst in bursts()]
+        assert len(await feed(ground, service, signed_bursts)) == EPOCHS
+        assert service.rejected == {"array: unsigned": sum(map(len, unsigned))}
+        assert service.pipeline.assembler.counts["epochs"] == EPOCHS
+
+
+def resigned(raw: bytes, sender: LinkSigning) -> bytes:
+    ((one,), _) = parsed([raw])
+    ids = one.sequence, one.system, one.component
+    return encode(one.message_id, one.payload, *ids, sender.sign)
