@@ -7,6 +7,7 @@ Nothing here reads a clock, opens a file or waits. A live link and a log feed th
 that a live run that is recorded and replayed gives the same estimates, bit for bit.
 """
 
+from functools import partial
 from itertools import groupby
 
 from msgspec import Struct, field, structs
@@ -172,7 +173,7 @@ class Pipeline:
             elapsed,
             track,
             self._monitor.advance(elapsed, track.aligned),
-            self._array_status(sensors),
+            partial(self._array_status, sensors),
         )
 
     def _correct(self, fix: GpsFix) -> None:

@@ -1,6 +1,6 @@
 """What is known at one epoch: all that is told to others."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +49,7 @@ class EstimateBlock:
     elapsed: Floats  # (k,) s
     track: Track
     heading: HeadingTrack
-    array: ArrayStatus  # as of the last epoch
+    array: Callable[[], ArrayStatus]  # as of now: to be asked before the next epochs come
 
     def __len__(self) -> int:
         return len(self.time_us)
@@ -68,5 +68,5 @@ class EstimateBlock:
             self.track.fused(i, time_us),
             attitude,
             self.heading.at(i, attitude),
-            self.array,
+            self.array(),
         )
