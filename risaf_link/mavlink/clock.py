@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.identity import autopilot_mode
 from risaf_link.mavlink.timesync import Sample, Synchronised, sample_in
 
 WINDOW_US = 10_000_000
 SAME_CLOCK_US = 500_000  # clocks that differ by less are one
-GROUND_STATION, NO_AUTOPILOT = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
 
-_HEARTBEAT = reader("HEARTBEAT", "type", "autopilot")
 _SYSTEM_TIME = reader("SYSTEM_TIME", "time_unix_usec", "time_boot_ms")
 
 Times = NDArray[np.int64]
@@ -87,9 +86,8 @@ class VehicleClock:
     def hear(self, frame: Frame, received_us: int) -> None:
         """Take note of a frame that may tell of an autopilot or of its time."""
         sender = (frame.system, frame.component)
-        if frame.message_id == IDS["HEARTBEAT"] and self._autopilot is None:
-            vehicle_type, autopilot = _HEARTBEAT(frame.payload)
-            if autopilot != NO_AUTOPILOT and vehicle_type != GROUND_STATION:
+        if frame.message_id == IDS["HEARTBEAT"]:
+            if self._autopilot is None and autopilot_mode(frame) is not None:
                 self._autopilot = sender
         elif frame.message_id == IDS["SYSTEM_TIME"] and sender == self._autopilot:
             _, boot_ms = _SYSTEM_TIME(frame.payload)

@@ -1,4 +1,7 @@
-"""Who we are on the network: part of the vehicle whose autopilot is heard."""
+"""Who we are on the network: part of the vehicle whose autopilot is heard.
+
+An autopilot is known by what its HEARTBEAT says, never by its component id.
+"""
 
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame
@@ -11,10 +14,17 @@ ARMED_FOR_US = 5_000_000  # since the last HEARTBEAT
 _HEARTBEAT = reader("HEARTBEAT", "type", "autopilot", "base_mode")
 
 
+def autopilot_mode(frame: Frame) -> int | None:
+    """Base mode in the HEARTBEAT of an autopilot; None: the frame is no such thing."""
+    if frame.message_id != IDS["HEARTBEAT"]:
+        return None
+    vehicle_type, autopilot, base_mode = _HEARTBEAT(frame.payload)
+    is_autopilot = autopilot != NO_AUTOPILOT and vehicle_type != GROUND_STATION
+    return int(base_mode) if is_autopilot else None
+
+
 class Identity:
     """Our ids, and what is known of the autopilot.
-
-    Autopilots are known by what their HEARTBEAT says, never by their component id.
 
     Parameters
     ----------
@@ -43,10 +53,9 @@ class Identity:
 
     def hear(self, frame: Frame, received_us: int) -> bool:
         """Take a frame that may be an autopilot's HEARTBEAT; whether our system id has changed."""
-        if frame.message_id != IDS["HEARTBEAT"] or (frame.system, frame.component) == self.own:
-            return False
-        vehicle_type, autopilot, base_mode = _HEARTBEAT(frame.payload)
-        if autopilot == NO_AUTOPILOT or vehicle_type == GROUND_STATION or not frame.system:
+        base_mode = autopilot_mode(frame)
+        is_own = (frame.system, frame.component) == self.own
+        if base_mode is None or is_own or not frame.system:
             return False
         if frame.system == self.system:
             self._armed_us = received_us if base_mode & ARMED else None

@@ -20,6 +20,7 @@ from risaf_link.mavlink.dialect import IDS, name_of, reader
 from risaf_link.mavlink.epoch import MAX_SENSORS, ArrayParameters, GyroChunk, Source
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.gps import READERS, GpsMessage
+from risaf_link.mavlink.identity import NO_AUTOPILOT
 
 MILLI = np.repeat([1e-3, 9.80665e-3], 3)  # rad/s and m/s^2 of a count of mrad/s and mG
 INVALID = -32768  # reading of a channel in our dialect
@@ -35,7 +36,6 @@ SCALED_IMUS = [IDS["SCALED_IMU"], IDS["SCALED_IMU2"], IDS["SCALED_IMU3"]]
 FINEST_FIRST = [IDS["HIGHRES_IMU"], IDS["RAW_IMU"], *SCALED_IMUS]
 SAMPLES = {IDS[name] for name in ("GYRO_ARRAY", "ACCEL_ARRAY", "DEBUG_FLOAT_ARRAY")}
 SAMPLES |= {*FINEST_FIRST}  # messages that carry readings
-NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 SIDEWAYS = frozenset({1, 2, 3, 4, 7, 8, *range(12, 18), *range(19, 26), 28, 29, 35, 37, 43, 45, 47})
 """MAV_TYPE of what goes where it does not point: it hovers, drifts with the wind, or dives.
 

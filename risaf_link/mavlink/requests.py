@@ -21,6 +21,7 @@ from msgspec import Meta
 from risaf_link.mavlink.commands import Command, Peer, Result
 from risaf_link.mavlink.dialect import IDS, MESSAGES, reader
 from risaf_link.mavlink.frame import Frame, FrameTable
+from risaf_link.mavlink.identity import autopilot_mode
 
 Requested = Literal[
     "HIGHRES_IMU",
@@ -45,7 +46,6 @@ IMUS: tuple[tuple[Requested, ...], ...] = (
 )
 
 GYRO_ARRAY = IDS["GYRO_ARRAY"]
-GROUND_STATION, NO_AUTOPILOT = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
 FRAME_BYTES = 12  # of a MAVLink 2 frame, around its payload
 SHARE = 0.5  # of a link, that all that is asked for may take
 WINDOW_US = 4_000_000  # in which a rate is measured: four of SYSTEM_TIME
@@ -58,7 +58,6 @@ CALM_US = 60_000_000  # of enough, after which a request counts as a first one
 GONE_US = 5_000_000  # without HEARTBEAT
 SLOWEST = 1.0  # Hz that is asked for
 
-_HEARTBEAT = reader("HEARTBEAT", "type", "autopilot")
 _ACK = reader("COMMAND_ACK", "command", "result", "target_system", "target_component")
 _DEBUG = reader("DEBUG_FLOAT_ARRAY", "name", "array_id")
 
@@ -253,8 +252,7 @@ class Requests:
             self._array_us = self._now_us
 
     def _hear_heartbeat(self, frame: Frame, peer: Peer) -> None:
-        vehicle_type, kind = _HEARTBEAT(frame.payload)
-        if kind == NO_AUTOPILOT or vehicle_type == GROUND_STATION:
+        if autopilot_mode(frame) is None:
             return
         sender = frame.system, frame.component
         autopilot = self._autopilots.get(peer)

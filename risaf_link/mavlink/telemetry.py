@@ -14,6 +14,7 @@ from risaf_link.core.heading import HeadingSource, HeadingState
 from risaf_link.core.health import ArrayHealth, SensorState
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import encode
+from risaf_link.mavlink.identity import NO_AUTOPILOT
 from risaf_link.mavlink.signing import LinkSigning
 
 Message = Literal[
@@ -42,7 +43,6 @@ DEFAULT_RATES: Rates = {
 take it for the autopilot's."""
 
 ONBOARD_CONTROLLER = 18  # MAV_TYPE
-NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 MAVLINK_VERSION = 3
 ESTIMATOR_ATTITUDE, ESTIMATOR_GPS_GLITCH = 1, 1024  # ESTIMATOR_STATUS_FLAGS
 UINT32_LIMIT = 2**32 - 1
