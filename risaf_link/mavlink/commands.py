@@ -1,6 +1,7 @@
 """Commands, COMMAND_LONG and COMMAND_INT: what is asked, by whom, and what is answered."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -64,6 +65,11 @@ class Order:
     def told(self) -> tuple[float, ...]:
         """The parameters, 0 for those that were left out: NaN."""
         return tuple(0.0 if math.isnan(value) else value for value in self.parameters)
+
+
+def concerns(to: Sequence[int], own: tuple[int, int]) -> bool:
+    """Whether what is addressed to a system and a component is for us, alone or among all."""
+    return to[0] in {0, own[0]} and to[1] in {0, own[1]}
 
 
 def whole(value: float) -> int | None:

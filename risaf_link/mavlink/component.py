@@ -16,7 +16,7 @@ from risaf_link import __version__
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.rotation import Floats
 from risaf_link.mavlink import timesync
-from risaf_link.mavlink.commands import Command, Order, Peer, Result, order_in, whole
+from risaf_link.mavlink.commands import Command, Order, Peer, Result, concerns, order_in, whole
 from risaf_link.mavlink.dialect import IDS, name_of
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.gyro_calibration import GyroCalibration, Report
@@ -288,13 +288,13 @@ class Component:
     # Commands
 
     def _obey(self, order: Order) -> None:
-        system, component = self._identity.own
-        if order.to[0] not in {0, system} or order.to[1] not in {0, component}:
+        own = self._identity.own
+        if not concerns(order.to, own):
             return
         command = self._commands.get(order.command)
         result = command(order) if command else Result.UNSUPPORTED
         done = result in {Result.ACCEPTED, Result.IN_PROGRESS}
-        if done or order.to == (system, component):
+        if done or order.to == own:
             in_progress = result is Result.IN_PROGRESS and command == self._calibrate
             self._acknowledge(order, result, self._calibration.percent if in_progress else 255)
 

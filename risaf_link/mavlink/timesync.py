@@ -19,6 +19,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from risaf_link.mavlink.commands import concerns
 from risaf_link.mavlink.dialect import reader
 from risaf_link.mavlink.frame import Frame
 
@@ -65,8 +66,7 @@ def answer_to(
 ) -> dict[str, Any] | None:
     """Fields of the answer to a frame, by a clock of ours; None: it is not for us to answer."""
     asked, asker = timesync_in(frame), (frame.system, frame.component)
-    for_us = asked.to[0] in {0, own[0]} and asked.to[1] in {0, own[1]}
-    if asked.tc1 != 0 or not for_us or asker == own:
+    if asked.tc1 != 0 or not concerns(asked.to, own) or asker == own:
         return None
     return {
         "tc1": max(clock_us(), 1) * 1000,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from risaf_link.mavlink.commands import Peer
+from risaf_link.mavlink.commands import Peer, concerns
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.parameters import Parameters
@@ -61,7 +61,7 @@ class Tuning:
         """
         asker = (frame.system, frame.component)
         if frame.message_id == IDS["PARAM_REQUEST_LIST"]:
-            if _concerns(_LIST(frame.payload), own):
+            if concerns(_LIST(frame.payload), own):
                 self.list_to(peer)
             return []
         if frame.message_id == IDS["PARAM_REQUEST_READ"]:
@@ -112,7 +112,7 @@ class Tuning:
     def _read(
         self, name: str, index: int, to: list[int], own: tuple[int, int], asker: tuple[int, int]
     ) -> Iterator[Answer]:
-        if not _concerns(to, own):
+        if not concerns(to, own):
             return
         by_name = self._parameters.index(name)
         wanted = by_name if index == UNKNOWN_INDEX else index
@@ -130,7 +130,7 @@ class Tuning:
         own: tuple[int, int],
         asker: tuple[int, int],
     ) -> Iterator[Answer]:
-        if not _concerns(to, own):
+        if not concerns(to, own):
             return
         index = self._parameters.index(name)
         if index is None:
@@ -142,11 +142,6 @@ class Tuning:
         elif not self._parameters.set(name, value):
             yield _error(ParamError.VALUE_OUT_OF_RANGE, name, index, asker)
         yield self.value(index, to_all=True)
-
-
-def _concerns(to: list[int] | tuple[int, ...], own: tuple[int, int]) -> bool:
-    """Whether something is addressed to us, alone or among all."""
-    return to[0] in {0, own[0]} and to[1] in {0, own[1]}
 
 
 def _error(error: ParamError, name: str, index: int, asker: tuple[int, int]) -> Answer:
