@@ -317,7 +317,7 @@ def test_a_stream_of_marks_costs_at_most_one_frames_checksum_a_byte(pattern, siz
 def summed(pieces, monkeypatch):
     """How many bytes go through a checksum while a stream is cut."""
     if frame_module.cut is not search.cut:
-        kernel = frame_module._kernel.Cutter(CRC_EXTRA)
+        kernel = frame_module.native.Cutter(CRC_EXTRA)
         monkeypatch.setattr(frame_module, "cut", kernel.cut)
         parsed(pieces)
         return kernel.summed

@@ -11,6 +11,7 @@ from msgspec import structs
 
 from risaf_link.core import aiding, eskf, fusion, quaternion, robust
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState
+from risaf_link.core.compiled import native
 from risaf_link.core.error_state import Correction, Gravity, Outcome
 from risaf_link.core.eskf import USUAL_HEADING
 from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate, Fusion, FusionParameters
@@ -18,15 +19,7 @@ from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.health import SILENT_AFTER, ArrayHealth, judge_silence
 from risaf_link.core.rotation import Floats
 
-if TYPE_CHECKING:
-    from risaf_link.core import _kernel
-else:
-    try:
-        from risaf_link.core import _kernel
-    except ImportError:
-        _kernel = None
-
-BUILT = _kernel is not None
+BUILT = native is not None
 """Whether there is a kernel."""
 
 _SHARED = (
@@ -68,7 +61,7 @@ class _Mean(_Plain):
     """`fusion.Mean` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
-        self.kernel = _kernel.Mean(parameters.gyro_noise, parameters.bias_walk)
+        self.kernel = native.Mean(parameters.gyro_noise, parameters.bias_walk)
 
 
 class _Median(_Plain):
@@ -76,14 +69,14 @@ class _Median(_Plain):
 
     def __init__(self, parameters: FusionParameters) -> None:
         p = parameters
-        self.kernel = _kernel.Median(p.gyro_noise, p.bias_walk, MAD_TO_STD)
+        self.kernel = native.Median(p.gyro_noise, p.bias_walk, MAD_TO_STD)
 
 
 class _Risaf(_Fusion):
     """`fusion.Risaf` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
-        self.kernel = _kernel.Risaf(*_told_risaf(parameters))
+        self.kernel = native.Risaf(*_told_risaf(parameters))
 
     def configure(self, parameters: FusionParameters) -> None:
         """Take new parameters; what was learnt stays."""
@@ -104,7 +97,7 @@ class _Robust(_Fusion):
     """`robust.Robust` in C++."""
 
     def __init__(self, parameters: FusionParameters) -> None:
-        self.kernel = _kernel.Robust(_told_robust(parameters))
+        self.kernel = native.Robust(_told_robust(parameters))
 
     def configure(self, parameters: FusionParameters) -> None:
         """Take new parameters; what was learnt stays."""
@@ -132,7 +125,7 @@ def _numbers(parameters: AttitudeParameters, heading: HeadingParameters) -> Any:
     constants = {**vars(eskf), **vars(aiding), **structs.asdict(parameters)}
     constants |= {name: constants[name].tolist() for name in _BY_AXIS}
     constants |= {"offset_std": heading.offset_std, "delay_std": heading.delay_std}
-    return _kernel.FilterNumbers(constants)
+    return native.FilterNumbers(constants)
 
 
 def _correction(told: Told) -> Correction:
@@ -146,7 +139,7 @@ class _Eskf:
     def __init__(
         self, parameters: AttitudeParameters, heading: HeadingParameters = USUAL_HEADING
     ) -> None:
-        self.kernel = _kernel.Eskf(_numbers(parameters, heading))
+        self.kernel = native.Eskf(_numbers(parameters, heading))
 
     @property
     def quaternion(self) -> Floats:
@@ -226,7 +219,7 @@ class _Eskf:
         return AttitudeState(time_us, q_nb, rate_b, bias_b, roll, pitch, yaw, aligned, resets)
 
 
-class _SpeedTracker(_kernel.SpeedTracker if BUILT else object):  # type: ignore[misc]
+class _SpeedTracker(native.SpeedTracker if BUILT else object):  # type: ignore[misc]
     """`aiding.SpeedTracker` in C++."""
 
     def __init__(self) -> None:
@@ -237,7 +230,7 @@ class _Aiding:
     """`aiding.Aiding` in C++."""
 
     def __init__(self, parameters: AttitudeParameters = aiding.USUAL) -> None:
-        self.kernel = _kernel.Aiding(_numbers(parameters, USUAL_HEADING))
+        self.kernel = native.Aiding(_numbers(parameters, USUAL_HEADING))
         self.speed = self.kernel.speed
 
     def take(
@@ -270,15 +263,15 @@ def advance(
     ):
         return None
     filters = attitude.kernel, aid.kernel
-    return _kernel.advance(gyros.kernel, accelerometers.kernel, *filters, dt, rates_b, forces_b)
+    return native.advance(gyros.kernel, accelerometers.kernel, *filters, dt, rates_b, forces_b)
 
 
 def _told_risaf(p: FusionParameters) -> tuple[float, ...]:
     return p.alpha, p.lower_quantile, p.upper_quantile, p.gyro_noise, p.bias_walk
 
 
-def _told_robust(parameters: FusionParameters) -> "_kernel.RobustParameters":
-    told = _kernel.RobustParameters()
+def _told_robust(parameters: FusionParameters) -> "native.RobustParameters":
+    told = native.RobustParameters()
     for name in _SHARED:
         setattr(told, name.lower(), getattr(robust, name))
     told.silent_after = SILENT_AFTER

@@ -13,10 +13,10 @@ The kernel finds the epochs. Where it was not built, every frame is handed on al
 
 from collections.abc import Collection, Iterator
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from risaf_link.core.compiled import native
 from risaf_link.mavlink.choice import PATIENCE_US
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import (
@@ -31,14 +31,6 @@ from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.gps import READERS
 from risaf_link.mavlink.ingest import NONE, ArrayInfo, Ingest
 from risaf_link.mavlink.tlog import Stamps
-
-if TYPE_CHECKING:
-    from risaf_link.core import _kernel
-else:
-    try:
-        from risaf_link.core import _kernel
-    except ImportError:
-        _kernel = None
 
 
 class Kind(IntEnum):
@@ -76,11 +68,11 @@ class BlockReader:
         self._ingest, self._assembler = ingest, assembler
         self._longest = longest
         self._kinds = _kinds(ingest, apart)
-        self._layout: _kernel.ArrayLayout
+        self._layout: native.ArrayLayout
         self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
-        self._finder: _kernel.EpochFinder | None = None
-        if _kernel:
-            self._finder = _kernel.EpochFinder(list(self._kinds), JUMP_US, PATIENCE_US)
+        self._finder: native.EpochFinder | None = None
+        if native:
+            self._finder = native.EpochFinder(list(self._kinds), JUMP_US, PATIENCE_US)
 
     def read(
         self, table: FrameTable, times_us: Stamps
@@ -156,12 +148,12 @@ class BlockReader:
         if wanted != self._laid_out:
             *_, gyros, forces = wanted
             self._laid_out = wanted
-            self._layout = _kernel.ArrayLayout(
+            self._layout = native.ArrayLayout(
                 source.system,
                 source.component,
                 source.array_id,
-                _kernel.Sensors(gyros, *info.count_of(is_gyro=True)),
-                _kernel.Sensors(forces, *info.count_of(is_gyro=False)),
+                native.Sensors(gyros, *info.count_of(is_gyro=True)),
+                native.Sensors(forces, *info.count_of(is_gyro=False)),
             )
 
 

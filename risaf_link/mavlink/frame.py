@@ -6,12 +6,13 @@ How a stream is cut into frames is said in `search`. The kernel does the same wh
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from risaf_link.core.compiled import native
 from risaf_link.mavlink import search
 from risaf_link.mavlink.dialect import CRC_EXTRA
 from risaf_link.mavlink.search import (
@@ -25,15 +26,7 @@ from risaf_link.mavlink.search import (
     SIGNED,
 )
 
-if TYPE_CHECKING:
-    from risaf_link.core import _kernel
-else:
-    try:
-        from risaf_link.core import _kernel
-    except ImportError:
-        _kernel = None
-
-cut = _kernel.Cutter(CRC_EXTRA).cut if _kernel else search.cut
+cut = native.Cutter(CRC_EXTRA).cut if native else search.cut
 
 
 class Frame(Struct, frozen=True):  # a frozen dataclass takes as long to make as all the rest
