@@ -68,6 +68,11 @@ class Gravity:
     by_errors: Floats = field(default_factory=lambda: np.zeros((3, 12)))
     """What the accelerometers' errors make of it."""
 
+    def less(self, force_errors: Floats) -> Floats:
+        """It without what the accelerometers are known to err by, (12,); (3,) m/s^2."""
+        corrected: Floats = self.gravity_n + self.by_errors @ force_errors
+        return corrected
+
 
 def drive(matrix: Floats, reading_b: Floats) -> Floats:
     """What the errors of a triad make of its reading in another frame, shape (3, 12).

@@ -309,8 +309,7 @@ class Eskf:
         A tilt that gravity contradicts for `gravity_distrust` seconds is doubted: its variance
         becomes as large as the contradiction.
         """
-        gravity_n = gravity.gravity_n + gravity.by_errors @ self._force_errors
-        north, east, down = gravity_n.tolist()
+        north, east, down = gravity.less(self._force_errors).tolist()
         gate = self._parameters.gate
         level, size = math.hypot(north, east), math.hypot(north, east, down)
         sound = 0.1 * GRAVITY < size < LARGEST_FORCE
@@ -495,7 +494,7 @@ class Eskf:
         """Find the accelerometers' bias along the vertical: what their reading is too large by."""
         row = np.zeros(STATES)
         row[ACCELEROMETER] = -gravity.by_errors[DOWN]
-        size = float(np.linalg.norm(gravity.gravity_n + gravity.by_errors @ self._force_errors))
+        size = float(np.linalg.norm(gravity.less(self._force_errors)))
         gate = self._parameters.gate
         self._fuse_all("size", (row,), (size - GRAVITY,), (gravity.down,), gate)
 

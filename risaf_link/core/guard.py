@@ -26,7 +26,7 @@ from risaf_link.core.attitude import Innovation, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
 from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
-from risaf_link.core.rotation import Floats, wrap
+from risaf_link.core.rotation import Floats, wrap, wraps
 from risaf_link.core.track import Track
 
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
@@ -128,7 +128,7 @@ class Dispute:
             return False
         recent = np.array([row for row in self._rejected if last_s - row[0] <= after])
         times, errors, variances = recent.T
-        errors = np.remainder(errors - last_error + math.pi, math.tau) - math.pi
+        errors = wraps(errors - last_error)
         older = times < last_s - after / 2.0
         halves = [errors[older], errors[~older]]
         if not all(map(len, halves)):

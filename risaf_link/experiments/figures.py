@@ -1,12 +1,11 @@
 """What all figures have in common."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from risaf_link.core.rotation import Floats
+from risaf_link.core.rotation import Floats, wraps
 from risaf_link.errors import ConfigError
 from risaf_link.sweep import Row
 
@@ -119,7 +118,7 @@ def draw_errors(axes: "Axes", result: Row, names: Sequence[str], titles: Mapping
     trace = result["trace"]
     for name in names:
         error = np.array(result["methods"][name]["yaw"], dtype=float) - np.array(trace["yaw"])
-        size = np.degrees(np.abs((error + math.pi) % (2.0 * math.pi) - math.pi))
+        size = np.degrees(np.abs(wraps(error)))
         axes.plot(trace["time_s"], size, color=colour(name), linewidth=1.0, label=titles[name])
     axes.set(yscale="log", ylim=(0.02, 200), ylabel="|heading error| (deg)")
 

@@ -7,7 +7,7 @@ import numpy as np
 from risaf_link.core.attitude import AttitudeParameters, Innovation
 from risaf_link.core.fusion import Epoch
 from risaf_link.core.heading import HeadingParameters
-from risaf_link.core.rotation import Floats, wrap
+from risaf_link.core.rotation import Floats, wrap, wraps
 from risaf_link.core.yaw_history import YawHistory
 from risaf_link.experiments.central import common_bias_std, medians
 from risaf_link.experiments.method import ArrayModel, Estimate, Gps, HeadingGate
@@ -145,8 +145,7 @@ class Particles:
     def _yaw_errors(self) -> Floats:
         """Yaw of every particle against the middle, rad, (m,)."""
         forward = np.einsum("kij,j->ki", exps(self._error), self._matrix_nb[:, 0])
-        yaws: Floats = np.arctan2(forward[:, 1], forward[:, 0]) - self._middle
-        return (yaws + math.pi) % (2.0 * math.pi) - math.pi
+        return wraps(np.arctan2(forward[:, 1], forward[:, 0]) - self._middle)
 
     def _spread(self, yaws: Floats) -> float:
         mean = float(self._weights @ yaws)

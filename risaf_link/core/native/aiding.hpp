@@ -177,10 +177,7 @@ class GravityFinder {
     gravity.gravity_n = matrix_ni * mean.force;
     gravity.lever = matrix_ni * mean.lever;
     gravity.by_errors = matrix_ni * mean.by_errors;
-    Vector corrected = gravity.gravity_n;
-    for (std::size_t i = 0; i < 3; ++i) {
-      corrected[i] += dot(gravity.by_errors[i], attitude.force_errors());
-    }
+    const Vector corrected = gravity.less(attitude.force_errors());
     const double size_square = dot(corrected, corrected);
     const Errors& by_size = gravity.by_errors[DOWN];
     const double size_variance = attitude.variance(ACCELEROMETER, by_size, by_size);
@@ -362,9 +359,7 @@ class Aiding {
       return {};
     }
     speed.advance(std::min(dt, c.LARGEST_STEP));
-    const bool finite =
-        std::isfinite(rate_b[0]) && std::isfinite(rate_b[1]) && std::isfinite(rate_b[2]);
-    if (dt > c.LONG_STEP || !finite) {
+    if (dt > c.LONG_STEP || !finite(rate_b)) {
       gravity_.restart();
       rest_.restart();
       return {};
@@ -386,7 +381,7 @@ class Aiding {
 
  private:
   std::optional<Gravity> usual(const Eskf& attitude, const Vector& force_b, double dt) {
-    if (std::isfinite(force_b[0]) && std::isfinite(force_b[1]) && std::isfinite(force_b[2])) {
+    if (finite(force_b)) {
       unfelt_ = 0.0;
       feels_ = true;
       return {};

@@ -60,6 +60,15 @@ struct Gravity {
   Vector gravity_n{};
   double forward = NaN, right = NaN, down = INFINITE;
   ByErrors lever{}, by_errors{};
+
+  // It without what the accelerometers are known to err by.
+  Vector less(const Errors& force_errors) const {
+    Vector corrected = gravity_n;
+    for (std::size_t i = 0; i < 3; ++i) {
+      corrected[i] += dot(by_errors[i], force_errors);
+    }
+    return corrected;
+  }
 };
 
 // What the errors of a triad make of its reading in another frame.
@@ -278,11 +287,7 @@ class Eskf {
   }
 
   Corrections correct_gravity(const Gravity& gravity) {
-    Vector gravity_n = gravity.gravity_n;
-    for (std::size_t i = 0; i < 3; ++i) {
-      gravity_n[i] += dot(gravity.by_errors[i], force_errors_);
-    }
-    const auto [north, east, down] = gravity_n;
+    const auto [north, east, down] = gravity.less(force_errors_);
     const double level = std::hypot(north, east), size = std::hypot(north, east, down);
     const double most = c.LARGEST_FORCE * c.LARGEST_FORCE;
     if (!(0.1 * c.GRAVITY < size && size < c.LARGEST_FORCE) ||
@@ -550,10 +555,7 @@ class Eskf {
 
   void learn_size(const Gravity& gravity) {
     State row{};
-    Vector gravity_n = gravity.gravity_n;
-    for (std::size_t i = 0; i < 3; ++i) {
-      gravity_n[i] += dot(gravity.by_errors[i], force_errors_);
-    }
+    const Vector gravity_n = gravity.less(force_errors_);
     for (std::size_t j = 0; j < ERRORS; ++j) {
       row[ACCELEROMETER + j] = -gravity.by_errors[DOWN][j];
     }

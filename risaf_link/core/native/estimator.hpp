@@ -14,7 +14,7 @@ namespace risaf {
 struct Known {
   double q_nb[4], rate_b[3], bias_b[3], angle_std[3], aligned, resets;
   double fused[3], variance[3], noise[3], bias_walk[3], active[3], valid;
-  double force_b[3], ahead;
+  double ahead;
 };
 
 // Carry the attitude on over `epochs`, with readings of `n` gyros and `m` accelerometers each.
@@ -47,7 +47,6 @@ void advance(Fusion& gyros, Robust& accelerometers, Eskf& filter, Aiding& aiding
       known->noise[k] = fused[k].noise;
       known->bias_walk[k] = fused[k].bias_walk;
       known->active[k] = static_cast<double>(fused[k].active);
-      known->force_b[k] = force_b[k];
     }
     const double up = 2.0 * (q_nb.x * q_nb.z - q_nb.w * q_nb.y);
     known->ahead = force_b[0] + filter.numbers().GRAVITY * up;

@@ -57,6 +57,10 @@ double dot(const std::array<double, N>& a, const std::array<double, N>& b) {
   return sum;
 }
 
+inline bool finite(const Vector& v) {
+  return std::isfinite(v[0]) && std::isfinite(v[1]) && std::isfinite(v[2]);
+}
+
 inline Vector operator*(const Matrix& m, const Vector& v) {
   return {dot(m[0], v), dot(m[1], v), dot(m[2], v)};
 }
