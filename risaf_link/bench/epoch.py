@@ -13,7 +13,7 @@ from risaf_link.core.aiding import Aiding
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState
 from risaf_link.core.earth import GRAVITY
 from risaf_link.core.eskf import Eskf
-from risaf_link.core.estimator import FORCE_RESOLUTION, NO_FORCE, Estimator
+from risaf_link.core.estimator import FORCE_RESOLUTION, Estimator, step
 from risaf_link.core.fusion import Epoch, Fusion, FusionParameters, Mean, Median, Risaf
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.robust import Robust
@@ -64,13 +64,9 @@ class NumpyForm:
 
     def step(self, dt: float, rates_b: Floats, forces_b: Floats) -> AttitudeState:
         """Carry the estimate on by one epoch; shapes (n, 3) and (m, 3)."""
-        fused = self._gyros.fuse(Epoch(0, dt, rates_b, forces_b, 0))
-        self._filter.predict(fused, dt)
-        force_b = NO_FORCE
-        if len(forces_b):
-            force_b = self._forces.fuse_readings(0, dt, forces_b).rate_b
-        self._aiding.take(self._filter, fused, force_b, dt)
-        return self._filter.state(0)
+        parts = self._gyros, self._forces, self._filter, self._aiding
+        _, state, _ = step(*parts, Epoch(0, dt, rates_b, forces_b, 0))
+        return state
 
     def run(self, samples: Samples) -> None:
         """All epochs, one after another."""

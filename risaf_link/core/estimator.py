@@ -2,8 +2,8 @@
 
     readings -> FusedRate -> predict -> gravity and rest
 
-Where there is a kernel it does the run; what it does is `Estimator.advance`. What GPS says comes
-in between two runs.
+Where there is a kernel it does the run; what it does at an epoch is `step`. What GPS says comes in
+between two runs.
 """
 
 from collections.abc import Callable
@@ -123,8 +123,8 @@ class Estimator:
         parts = self.fusion, self._force_fusion, self._filter, self._aiding
         values = kernel.advance(*parts, dt, rates_b, forces_b)
         if values is None:
-            steps = zip(dt.tolist(), rates_b, forces_b, strict=True)
-            track = Track.of([self._step(Epoch(0, *step, 0)) for step in steps])
+            epochs = zip(dt.tolist(), rates_b, forces_b, strict=True)
+            track = Track.of([step(*parts, Epoch(0, *epoch, 0)) for epoch in epochs])
         else:
             track = Track(values)
         elapsed: Floats = dt.copy()
@@ -134,17 +134,6 @@ class Estimator:
         self.elapsed = float(elapsed[-1])
         self._guard.advance(track, elapsed, dt)
         return track, elapsed
-
-    def _step(self, epoch: Epoch) -> tuple[FusedRate, AttitudeState, Floats]:
-        """One epoch; this is what the kernel does as well."""
-        fused = self.fusion.fuse(epoch)
-        self._filter.predict(fused, epoch.dt)
-        force_b = NO_FORCE
-        if len(epoch.forces_b):
-            force_b = self._force_fusion.fuse_readings(0, epoch.dt, epoch.forces_b).rate_b
-        if not isinstance(self._filter, PaperFilter):
-            self._aiding.take(self._filter, fused, force_b, epoch.dt)
-        return fused, self._filter.state(0), force_b
 
     def correct(self, motion: Motion, latitude: float) -> Innovation | None:
         """Use what a fix says; None: it says nothing of heading.
@@ -165,3 +154,21 @@ class Estimator:
                 ahead = self._guard.ahead(motion)
                 self._aiding.speed.hear(ahead, motion.speed_std**2, self._parameters[2].delay)
         return innovation
+
+
+def step(
+    gyros: Fusion,
+    accelerometers: kernel.Robust,
+    attitude: kernel.Eskf | PaperFilter,
+    aiding: kernel.Aiding,
+    epoch: Epoch,
+) -> tuple[FusedRate, AttitudeState, Floats]:
+    """Carry all of them on by one epoch; the fused rate, the attitude and the specific force."""
+    fused = gyros.fuse(epoch)
+    attitude.predict(fused, epoch.dt)
+    force_b = NO_FORCE
+    if len(epoch.forces_b):
+        force_b = accelerometers.fuse_readings(0, epoch.dt, epoch.forces_b).rate_b
+    if not isinstance(attitude, PaperFilter):
+        aiding.take(attitude, fused, force_b, epoch.dt)
+    return fused, attitude.state(0), force_b

@@ -285,12 +285,12 @@ def _told_robust(parameters: FusionParameters) -> "native.RobustParameters":
 Mean: Callable[[FusionParameters], Fusion] = _Mean if BUILT else fusion.Mean
 Median: Callable[[FusionParameters], Fusion] = _Median if BUILT else fusion.Median
 Risaf: Callable[[FusionParameters], Fusion] = _Risaf if BUILT else fusion.Risaf
-Robust = _Robust if BUILT else robust.Robust
 if TYPE_CHECKING or not BUILT:
     from risaf_link.core.aiding import Aiding, SpeedTracker
     from risaf_link.core.eskf import Eskf
+    from risaf_link.core.robust import Robust
 else:
-    Eskf, Aiding, SpeedTracker = _Eskf, _Aiding, _SpeedTracker
+    Robust, Eskf, Aiding, SpeedTracker = _Robust, _Eskf, _Aiding, _SpeedTracker
 
 __all__ = [
     "BUILT",

@@ -13,17 +13,17 @@ from risaf_link.core.rotation import Floats
 Q_NB, RATE, BIAS, STD = slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13)
 ALIGNED, RESETS = 13, 14
 FUSED, VARIANCE, NOISE, WALK = slice(15, 18), slice(18, 21), slice(21, 24), slice(24, 27)
-ACTIVE, VALID, FORCE, AHEAD = slice(27, 30), 30, slice(31, 34), 34
-COLUMNS = 35
+ACTIVE, VALID, AHEAD = slice(27, 30), 30, 31
+COLUMNS = 32
 YAW_STD = 12
 
 
 class Track:
-    """Fused rates, attitudes and specific forces of k epochs, one after another.
+    """Fused rates and attitudes of k epochs, one after another.
 
     Parameters
     ----------
-    values : ndarray, shape (k, 35)
+    values : ndarray, shape (k, 32)
         The columns that this module names; units are those of `FusedRate` and `AttitudeState`.
     """
 
@@ -39,7 +39,7 @@ class Track:
                     *(state.q_nb, state.rate_b, state.bias_b),
                     (state.roll_std, state.pitch_std, state.yaw_std, state.aligned, state.resets),
                     *(fused.rate_b, fused.variance, fused.noise, fused.bias_walk, fused.active),
-                    *((fused.valid,), force_b, (_ahead(state.q_nb, force_b),)),
+                    (fused.valid, _ahead(state.q_nb, force_b)),
                 )
             )
             for fused, state, force_b in epochs
@@ -85,13 +85,11 @@ class Track:
         return self.values[:, STD]
 
     @property
-    def force_b(self) -> Floats:
-        """Fused specific force, (k, 3), m/s^2; NaN: there is no accelerometer."""
-        return self.values[:, FORCE]
-
-    @property
     def ahead(self) -> Floats:
-        """Of the specific force what accelerates ahead, gravity taken off, (k,), m/s^2."""
+        """Of the specific force what accelerates ahead, gravity taken off, (k,), m/s^2.
+
+        NaN: there is no accelerometer.
+        """
         return self.values[:, AHEAD]
 
     @property
