@@ -33,6 +33,10 @@ class Outage:
         default_factory=lambda: defaultdict(ErrorAccount)
     )
 
+    def includes(self, elapsed: Floats) -> NDArray[np.bool_]:
+        """Which times, s from the first sample, are in it."""
+        return (self.start <= elapsed) & (elapsed <= self.end)
+
     def rows(self) -> list[dict[str, Any]]:
         """One row a reference, for JSON; one without numbers if there was nothing to compare."""
         scores: dict[Reference | None, HeadingScore | None]
@@ -182,7 +186,7 @@ class Scorer:
         """Find the outages that the log itself has."""
         out = state == HeadingState.DEAD_RECKONING
         for outage in self._withheld:
-            out &= ~((outage.start <= elapsed) & (elapsed <= outage.end))
+            out &= ~outage.includes(elapsed)
         is_open = bool(self._found) and math.isinf(self._found[-1].end)
         for i in np.flatnonzero(np.diff(out, prepend=is_open)).tolist():
             if out[i]:
@@ -196,7 +200,7 @@ class Scorer:
         if reference == "truth":
             self.truth.add_all(elapsed, errors)
         for outage in (*self._withheld, *self._found):
-            inside = (outage.start <= elapsed) & (elapsed <= outage.end)
+            inside = outage.includes(elapsed)
             if inside.any():
                 outage.errors[reference].add_all(elapsed[inside], errors[inside])
 

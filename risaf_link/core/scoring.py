@@ -91,11 +91,6 @@ class YawTrack:
             self._points.clear()
         self._points.append((time_us, yaw))
 
-    @property
-    def newest_us(self) -> int | None:
-        """Time of the last estimate."""
-        return self._points[-1][0] if self._points else None
-
     def at(self, time_us: int) -> float | None:
         """Yaw at a time, interpolated, rad; None where the track does not reach.
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -51,6 +50,11 @@ class Case(Struct, frozen=True, forbid_unknown_fields=True):
         """Name of this case and of the program that runs it."""
         content = msgspec.json.encode(self) + program(*PARTS).encode()
         return f"{self.scenario}-{self.seed}-{hashlib.sha256(content).hexdigest()[:16]}"
+
+    def parameters(self) -> Row:
+        """What it says, but for its seed and sources."""
+        told = {name: getattr(self, name) for name in self.__struct_fields__}
+        return {key: value for key, value in told.items() if key not in {"seed", "own", "traced"}}
 
     def run(self) -> Row:
         """Run the case."""
@@ -217,10 +221,3 @@ def _degrees(account: ErrorAccount) -> Row | None:
         "max_deg": math.degrees(score.largest),
         "drift_deg_per_min": math.degrees(score.drift) * 60.0,
     }
-
-
-def outage_rmse(result: Row, method: str, reference: str = "truth") -> Iterator[float]:
-    """Heading RMSE, deg, of a method in every outage of a result; NaN where it had no heading."""
-    for outage in result["methods"][method]["outages"]:
-        score = outage[reference]
-        yield score["rmse_deg"] if score else math.nan

@@ -120,7 +120,7 @@ def drive(setting: Setting, name: str) -> Section:
         d.paper,
         [*head, "paper, deg"],
         rows,
-        {"case": _parameters(cases[0]), "seeds": list(seeds)},
+        {"case": cases[0].parameters(), "seeds": list(seeds)},
         {
             "rmse_deg": {
                 method: {ref: rmses(results, method, ref) for ref in ("truth", "gps")}
@@ -255,7 +255,7 @@ def outages(setting: Setting) -> Section:
         "RISAF is below the standard EKF in all four, and even; the EKF is not. No numbers.",
         ["method", *(f"section {i + 1}, deg" for i in range(4))],
         [(called[m], *(middle for middle, _, _ in by_section[m])) for m in names],
-        {"case": _parameters(cases[0]), "seeds": list(seeds)},
+        {"case": cases[0].parameters(), "seeds": list(seeds)},
         {"rmse_deg": {method: rmses(results, method) for method in names}},
     )
     return write(setting, section, made)
@@ -269,9 +269,3 @@ def _titles(setting: Setting, names: Sequence[str]) -> dict[str, str]:
 def _ratio(results: Sequence[Row], above: str, below: str) -> float:
     ratios = np.array(rmses(results, above)) / np.array(rmses(results, below))
     return spread(ratios.tolist())[0]
-
-
-def _parameters(case: Case) -> dict[str, Any]:
-    """What a case says, but for its seed and sources."""
-    told = {name: getattr(case, name) for name in case.__struct_fields__}
-    return {name: value for name, value in told.items() if name not in {"seed", "own", "traced"}}

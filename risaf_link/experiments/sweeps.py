@@ -65,7 +65,7 @@ def montecarlo(setting: Setting) -> Section:
         ["method", *(SPIKE_HEAD.format(p) for p in percent), "rises by, %"],
         [(called[n], *bands[n][:, 0].tolist(), 100.0 * flat[n]) for n in names],
         {
-            **_told(cases[0]),
+            **cases[0].parameters(),
             "probabilities": probabilities,
             "seeds": list(seeds),
         },
@@ -117,7 +117,7 @@ def sensitivity(setting: Setting) -> Section:
         "the RMSE stays stable for alpha from 0.95 to 0.999 and gates from 15 to 30 %.",
         ["parameters", *(f"{kind}, deg" for kind in kinds)],
         rows,
-        {**_told(cases[0]), "scenario": list(kinds), "seeds": list(seeds)},
+        {**cases[0].parameters(), "scenario": list(kinds), "seeds": list(seeds)},
         {"rmse_deg": {k: {name: rmses(of[k], name) for name in names} for k in kinds}},
     )
     return write(setting, section, made)
@@ -173,12 +173,7 @@ def faults(setting: Setting) -> Section:
         "RISAF is 2.6 (Drive I) and 5.8 (Drive II) times better than the mean.",
         ["fault", *(f"{called[name]}, deg" for name in names), "mean over RISAF"],
         rows,
-        {**_told(cases[0]), "faults": kinds, "seeds": list(seeds)},
+        {**cases[0].parameters(), "faults": kinds, "seeds": list(seeds)},
         {"rmse_deg": {k: {name: rmses(of[k], name) for name in names} for k in kinds}},
     )
     return write(setting, section, made)
-
-
-def _told(case: Case) -> dict[str, Any]:
-    told = {name: getattr(case, name) for name in case.__struct_fields__}
-    return {name: value for name, value in told.items() if name not in {"seed", "own", "traced"}}
