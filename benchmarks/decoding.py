@@ -20,8 +20,7 @@ import time
 from importlib.util import find_spec
 from pathlib import Path
 
-from pymavlink import mavutil
-
+from risaf_link.bench.reading import recv_match, tables
 from risaf_link.links.file import read
 from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk, RegularEpochs
@@ -45,11 +44,6 @@ class Decoder:
             self.assembler.add(datum)
 
 
-def tables(path: Path) -> int:
-    """Count the frames in tables."""
-    return sum(len(table) for table, _ in TlogReader(read(path)).tables())
-
-
 def epochs(path: Path) -> int:
     """Count the epochs in blocks, and those between."""
     decoder = Decoder()
@@ -67,16 +61,6 @@ def frame_by_frame(path: Path) -> int:
     for time_us, frame in TlogReader(read(path)):
         decoder.step(frame, time_us)
     return decoder.assembler.counts["epochs"]
-
-
-def recv_match(path: Path) -> int:
-    """Count the messages that pymavlink finds."""
-    log = mavutil.mavlink_connection(str(path))
-    found = 0
-    while log.recv_match() is not None:
-        found += 1
-    log.close()
-    return found
 
 
 def fasttlogparser(path: Path) -> int:

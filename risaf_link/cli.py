@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # what a command needs is imported when it runs: help must co
     from risaf_link.config import Config
     from risaf_link.core.estimate import EstimateBlock
     from risaf_link.publish.plot import HeadingPlot
-    from risaf_link.replay import Replay
+    from risaf_link.replay import Replay, Selection
 
 GROUPS = ("limits", "epoch", "replay", "log", "live", "start")  # of `bench`
 
@@ -221,10 +221,16 @@ def replay(
     risaf-link replay drive.tlog --outage 100:300 --set fusion.method=mean --json
     risaf-link replay night/*/*.tlog --csv tables --cluster tcp://10.0.0.1:8786
     """
+    from risaf_link.kept import chosen_by, load_in_force
+    from risaf_link.replay import Selection
+
+    config = load_in_force(config_path, settings)
+    span = options["start"], options["end"], options["outages"]
+    selection = Selection(*span, chosen_by(settings))
     if len(logs) > 1 or options["workers"] or options["cluster"]:
-        _replay_all(logs, config_path, settings, options)
+        _replay_all(logs, config, selection, options)
     else:
-        _replay_one(logs[0], config_path, settings, options)
+        _replay_one(logs[0], config, selection, options)
 
 
 @main.command()
@@ -457,15 +463,11 @@ def check_config(file: Path) -> None:
 
 
 def _replay_one(
-    log: Path, config_path: Path | None, settings: tuple[str, ...], options: dict[str, Any]
+    log: Path, config: "Config", selection: "Selection", options: dict[str, Any]
 ) -> None:
-    from risaf_link.kept import chosen_by, load_in_force
-    from risaf_link.replay import Replay, Selection
+    from risaf_link.replay import Replay
     from risaf_link.words import summary_text
 
-    config = load_in_force(config_path, settings)
-    span = options["start"], options["end"], options["outages"]
-    selection = Selection(*span, chosen_by(settings))
     replayed = Replay(config, log, selection, keep_trace=bool(options["plot"]))
     plot = _plot(options["plot"])
     with ExitStack() as files, _progress(log) as progress:
@@ -481,22 +483,14 @@ def _replay_one(
 
 
 def _replay_all(
-    logs: tuple[Path, ...],
-    config_path: Path | None,
-    settings: tuple[str, ...],
-    options: dict[str, Any],
+    logs: tuple[Path, ...], config: "Config", selection: "Selection", options: dict[str, Any]
 ) -> None:
     from risaf_link.fleet import replay_all
-    from risaf_link.kept import chosen_by, load_in_force
-    from risaf_link.replay import Selection
     from risaf_link.words import fleet_text
 
     for name in ("speed", "out", "plot"):
         if options[name] is not None:
             raise ConfigError(f"--{name}: only for one log, without --workers and --cluster")
-    config = load_in_force(config_path, settings)
-    span = options["start"], options["end"], options["outages"]
-    selection = Selection(*span, chosen_by(settings))
     spread = options["csv"], options["workers"], options["cluster"]
     rows = replay_all(logs, config, selection, *spread)
     click.echo(json.dumps(rows) if options["as_json"] else fleet_text(rows))

@@ -107,15 +107,15 @@ def mixed(extent: Extent, directory: Path, log: Path | None = None) -> Iterator[
     if log is None:
         _write_mixed(path, extent.mixed_frames)
     size = path.stat().st_size / 1e6
-    rates = [size / taken for taken in seconds_of(lambda: _count(path), extent.repeats)]
+    rates = [size / taken for taken in seconds_of(lambda: tables(path), extent.repeats)]
     few = directory / "part.tlog"
     few.write_bytes(b"".join(_first_records(path, extent.rival_frames)))
     part = few.stat().st_size / 1e6
-    text = f"log of an autopilot, {size / _count(path) * 1e6:.0f} bytes a record"
+    text = f"log of an autopilot, {size / tables(path) * 1e6:.0f} bytes a record"
     figure = partial(
         Figure, unit="MB/s", ours=Spread.of(rates), goal=MIXED, more_is_better=True, text=text
     )
-    slow = [part / taken for taken in seconds_of(lambda: _recv_match(few), extent.runs)]
+    slow = [part / taken for taken in seconds_of(lambda: recv_match(few), extent.runs)]
     yield figure("mixed_pymavlink", against="recv_match", reference=Spread.of(slow))
     against = "fasttlogparser"
     if not has(against):
@@ -142,17 +142,21 @@ def _first_records(path: Path, count: int) -> Iterator[bytes]:
         yield record(one.time_us, one.frame.raw)
 
 
-def _count(path: Path) -> int:
+def tables(path: Path) -> int:
+    """Count the frames of a log, found in tables."""
     return sum(len(table) for table, _ in TlogReader(read(path)).tables())
 
 
-def _recv_match(path: Path) -> None:
+def recv_match(path: Path) -> int:
+    """Count the messages that pymavlink finds."""
     from pymavlink import mavutil
 
     log = mavutil.mavlink_connection(str(path))
+    found = 0
     while log.recv_match() is not None:
-        pass
+        found += 1
     log.close()
+    return found
 
 
 def _fasttlogparser(path: Path, repeats: int) -> list[float]:
