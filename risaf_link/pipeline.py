@@ -18,7 +18,6 @@ from risaf_link.core.estimate import ArrayStatus, Estimate, EstimateBlock
 from risaf_link.core.estimator import Estimator
 from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
-from risaf_link.core.health import ArrayHealth
 from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.dialect import IDS
@@ -27,7 +26,6 @@ from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.ingest import SAMPLES, GpsParameters, Ingest
 
 MOST_WAITING = 256  # epochs
-HEALTH_PERIOD = 0.1  # s, from one judgement of the sensors to the next
 
 
 class PipelineParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -75,8 +73,6 @@ class Pipeline:
         self._clock = VehicleClock(own[1])
         self._parameters = p
         self._estimator = Estimator(p.fusion, p.attitude, p.heading)
-        self._health = self._estimator.fusion.health()
-        self._judged = 0.0  # s, when it was made
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
         self._waiting: list[tuple[Epoch, int]] = []
@@ -192,15 +188,8 @@ class Pipeline:
             counts["incomplete"],
             counts["samples_lost"],
             sensors,
-            self._judge(sensors),
+            self._estimator.fusion.health(),
         )
-
-    def _judge(self, sensors: int) -> ArrayHealth:
-        """Standing of the sensors, judged anew now and then."""
-        now = self._estimator.elapsed
-        if now - self._judged >= HEALTH_PERIOD or len(self._health.state) != sensors:
-            self._health, self._judged = self._estimator.fusion.health(), now
-        return self._health
 
     def _fits(self, sensors: int) -> bool:
         if self._calibration is None:

@@ -1,6 +1,7 @@
 """What the component says by itself, and what it makes of commands; pymavlink reads every frame."""
 
 import struct
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +45,9 @@ ESTIMATE = an_estimate()
 
 
 def at(time_s: float, **changes) -> Estimate:
-    return replace(ESTIMATE, time_us=round(time_s * 1e6), elapsed=time_s, **changes)
+    estimate = copy(ESTIMATE)
+    vars(estimate).update(time_us=round(time_s * 1e6), elapsed=time_s, **changes)
+    return estimate
 
 
 def heartbeat(system, component=1, autopilot=12, kind=2, base_mode=0):

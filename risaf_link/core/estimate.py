@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,17 +27,44 @@ class ArrayStatus:
     health: ArrayHealth
 
 
-@dataclass(frozen=True, slots=True)
 class Estimate:
-    """The estimator's output at one epoch."""
+    """The estimator's output at one epoch, put together as far as it is asked for.
 
-    time_us: int  # as the samples were stamped
-    boot_us: int  # the same instant on the vehicle's boot clock
-    elapsed: float  # seconds since the first epoch, whatever the clocks did
-    fused: FusedRate
-    attitude: AttitudeState
-    heading: HeadingStatus
-    array: ArrayStatus
+    Attributes
+    ----------
+    time_us : int
+        As the samples were stamped.
+    boot_us : int
+        The same instant on the vehicle's boot clock.
+    elapsed : float
+        Seconds since the first epoch, whatever the clocks did.
+    """
+
+    def __init__(self, block: "EstimateBlock", i: int) -> None:
+        self._block, self._i = block, i
+        self.time_us = int(block.time_us[i])
+        self.boot_us = int(block.boot_us[i])
+        self.elapsed = float(block.elapsed[i])
+
+    @cached_property
+    def fused(self) -> FusedRate:
+        """The array's rate."""
+        return self._block.track.fused(self._i, self.time_us)
+
+    @cached_property
+    def attitude(self) -> AttitudeState:
+        """The filter's attitude."""
+        return self._block.track.attitude(self._i, self.time_us)
+
+    @cached_property
+    def heading(self) -> HeadingStatus:
+        """GPS heading, and what came of it."""
+        return self._block.heading.at(self._i, self.attitude)
+
+    @cached_property
+    def array(self) -> ArrayStatus:
+        """The account of the array, when this is first asked for."""
+        return self._block.array()
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +77,7 @@ class EstimateBlock:
     elapsed: Floats  # (k,) s
     track: Track
     heading: HeadingTrack
-    array: Callable[[], ArrayStatus]  # as of now: to be asked before the next epochs come
+    array: Callable[[], ArrayStatus]  # as of now
 
     def __len__(self) -> int:
         return len(self.time_us)
@@ -59,14 +87,4 @@ class EstimateBlock:
 
     def at(self, i: int) -> Estimate:
         """The output at one epoch."""
-        time_us = int(self.time_us[i])
-        attitude = self.track.attitude(i, time_us)
-        return Estimate(
-            time_us,
-            int(self.boot_us[i]),
-            float(self.elapsed[i]),
-            self.track.fused(i, time_us),
-            attitude,
-            self.heading.at(i, attitude),
-            self.array(),
-        )
+        return Estimate(self, i)

@@ -164,6 +164,8 @@ class HeadingGuard:
         self._dispute = Dispute(LONGEST_DEFENCE * parameters.reset_after)
         self._elapsed = 0.0  # s
         self._last = -math.inf  # s, when the last heading came
+        self._unread: list[tuple[Track, Floats, Floats]] = []  # what `advance` was told
+        self._unread_epochs = 0
         self._turned = np.zeros((ROOM, 4))  # rad, the rate's integral in body axes; s
         self._turns = 1  # how many of them are known
         self._aligned = False
@@ -179,13 +181,25 @@ class HeadingGuard:
 
         The track is given the doubt about yaw that headings have left, which no filter knows of.
         """
-        self._turn(track.rate_b, elapsed, dt)
-        self._elapsed = float(elapsed[-1])
-        self._aligned = bool(track.aligned[-1])
-        self.gear.feel(track.ahead, dt)
+        self._unread.append((track, elapsed, dt))
+        self._unread_epochs += len(dt)
+        if self._unread_epochs >= RATES:
+            self._catch_up()
         if self._whiteness.doubt:
             doubted = np.hypot(track.yaw_std, self._whiteness.doubt)
             track.yaw_std[:] = np.minimum(doubted, math.pi)
+
+    def _catch_up(self) -> None:
+        """Read the epochs since the last fix, together: one by one each would cost as much."""
+        if not self._unread:
+            return
+        tracks, times, steps = zip(*self._unread, strict=True)
+        self._unread, self._unread_epochs = [], 0
+        elapsed, dt = np.concatenate(times), np.concatenate(steps)
+        self._turn(np.concatenate([track.rate_b for track in tracks]), elapsed, dt)
+        self.gear.feel(np.concatenate([track.ahead for track in tracks]), dt)
+        self._elapsed = float(elapsed[-1])
+        self._aligned = bool(tracks[-1].aligned[-1])
 
     def _turn(self, rate_b: Floats, elapsed: Floats, dt: Floats) -> None:
         """Go on with the rate's integral."""
@@ -205,6 +219,7 @@ class HeadingGuard:
 
     def take(self, estimator: Estimator, motion: Motion) -> Innovation | None:
         """Use what one fix says; None: it says nothing of heading."""
+        self._catch_up()
         self._hear(motion)
         if motion.heading is None:
             return None
@@ -221,7 +236,10 @@ class HeadingGuard:
         return self._judge(estimator, motion, pause)
 
     def ahead(self, motion: Motion) -> float:
-        """Speed of the vehicle, not the antenna, ahead, m/s; negative backwards."""
+        """Speed of the vehicle, not the antenna, ahead, m/s, by the fix that was just taken.
+
+        Negative backwards.
+        """
         rate_x, rate_y, rate_z = self._rate_before(self._parameters.delay)
         x, y, z = self._parameters.antenna
         across = rate_z * x - rate_x * z

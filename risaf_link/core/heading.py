@@ -294,6 +294,12 @@ class HeadingState(IntEnum):
     DEAD_RECKONING = 5  # no fix; yaw is carried on by the gyros alone
 
 
+States = tuple[HeadingState, HeadingState]
+"""While yaw is not known, and when it is."""
+
+WITHOUT_FIX: States = (HeadingState.NO_FIX, HeadingState.DEAD_RECKONING)
+
+
 @dataclass(frozen=True, slots=True)
 class HeadingStatus:
     """GPS heading, and what came of it, at one epoch."""
@@ -319,11 +325,22 @@ class HeadingTrack:
     speed: float  # m/s
     fused_count: int
     rejected_count: int
-    time_since_fused: Floats  # (k,) s
-    state: NDArray[np.int64]  # (k,) HeadingState
+    fused_s: float  # when a heading was fused; NaN: never
+    lost_s: float  # from when on there is no fix
+    with_fix: States  # until then
+    elapsed: Floats  # (k,) s
+    aligned: NDArray[np.bool_]  # (k,)
+
+    @property
+    def state(self) -> NDArray[np.int64]:
+        """HeadingState at each epoch, (k,)."""
+        states = np.array((self.with_fix, WITHOUT_FIX), np.int64)
+        return states[(self.elapsed > self.lost_s).astype(np.intp), self.aligned.astype(np.intp)]
 
     def at(self, i: int, attitude: AttitudeState) -> HeadingStatus:
         """The account at one epoch."""
+        elapsed = float(self.elapsed[i])
+        states = WITHOUT_FIX if elapsed > self.lost_s else self.with_fix
         return HeadingStatus(
             attitude.time_us,
             self.heading,
@@ -331,10 +348,10 @@ class HeadingTrack:
             yaw_of(attitude.q_nb),
             attitude.yaw_std,
             self.speed,
-            float(self.time_since_fused[i]),
+            elapsed - self.fused_s,
             self.fused_count,
             self.rejected_count,
-            HeadingState(int(self.state[i])),
+            states[attitude.aligned],
         )
 
 
@@ -372,18 +389,17 @@ class HeadingMonitor:
         aligned : ndarray, shape (k,)
         """
         self._elapsed = float(elapsed[-1])
-        state = self._having_fix(aligned)
-        if self._elapsed - self._fix_s > self._parameters.timeout:
-            lost = np.where(aligned, HeadingState.DEAD_RECKONING, HeadingState.NO_FIX)
-            state = np.where(elapsed - self._fix_s > self._parameters.timeout, lost, state)
         return HeadingTrack(
             self._heading,
             self._innovation,
             self._motion.speed,
             self._fused_count,
             self._rejected_count,
-            elapsed - self._fused_s,
-            state,
+            self._fused_s,
+            self._fix_s + self._parameters.timeout,
+            self._with_fix(),
+            elapsed,
+            aligned,
         )
 
     def note_motion(self, motion: Motion) -> None:
@@ -400,13 +416,13 @@ class HeadingMonitor:
         else:
             self._rejected_count += 1
 
-    def _having_fix(self, aligned: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def _with_fix(self) -> States:
         if self._motion.heading is None:
-            return np.full(aligned.shape, HeadingState.TOO_SLOW)
+            return HeadingState.TOO_SLOW, HeadingState.TOO_SLOW
         if self._innovation is None or self._innovation.reset:
-            return np.full(aligned.shape, HeadingState.ALIGNING)
+            return HeadingState.ALIGNING, HeadingState.ALIGNING
         judged = HeadingState.FUSING if self._innovation.fused else HeadingState.REJECTING
-        return np.where(aligned, judged, HeadingState.ALIGNING)
+        return HeadingState.ALIGNING, judged
 
 
 def _known(value: float, otherwise: float) -> float:

@@ -50,11 +50,6 @@ class Notices:
         before, self._estimate = self._estimate, estimate
         if before and estimate.time_us < before.time_us:
             self._clock_resets += 1
-        heading = estimate.heading
-        if heading.state is HeadingState.REJECTING:
-            self._rejecting |= heading.time_since_fused > REJECTED_FOR
-        elif heading.state is not HeadingState.TOO_SLOW:
-            self._rejecting = False
 
     def due(self, now_us: int, has_stalled: bool, trouble: str) -> list[Notice]:
         """What is to be told now.
@@ -99,6 +94,11 @@ class Notices:
         if self._changed("gps", out, False, now_us):
             lost = Notice(Severity.WARNING, "GPS lost: heading by dead reckoning")
             notices.append(lost if out else Notice(Severity.INFO, "GPS is back"))
+        heading = estimate.heading
+        if heading.state is HeadingState.REJECTING:
+            self._rejecting |= heading.time_since_fused > REJECTED_FOR
+        elif heading.state is not HeadingState.TOO_SLOW:
+            self._rejecting = False
         if self._changed("heading", self._rejecting, False, now_us):
             notices.append(self._of_rejection(estimate))
         dead = health.count(SensorState.DEAD)
