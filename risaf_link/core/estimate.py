@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from risaf_link.core.attitude import AttitudeState
@@ -67,8 +68,7 @@ class Estimate:
         return self._block.array()
 
 
-@dataclass(frozen=True, slots=True)
-class EstimateBlock:
+class EstimateBlock(Struct, frozen=True):
     """The estimator's output at k epochs between which no fix came."""
 
     time_us: NDArray[np.int64]  # (k,)

@@ -73,8 +73,7 @@ class Epoch:
     lost: int  # sensors whose gyro sample never came
 
 
-@dataclass(frozen=True, slots=True)
-class EpochBlock:
+class EpochBlock(Struct, frozen=True):  # as those that come of it: live, it is one an epoch
     """k epochs, one after another, of an array that stays as it is."""
 
     time_us: NDArray[np.int64]  # (k,)

@@ -316,8 +316,7 @@ class HeadingStatus:
     state: HeadingState
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingTrack:
+class HeadingTrack(Struct, frozen=True):
     """`HeadingStatus` at k epochs between which no fix came."""
 
     heading: Heading | None

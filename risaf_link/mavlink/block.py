@@ -70,6 +70,7 @@ class BlockReader:
         self._kinds = _kinds(ingest, apart)
         self._layout: native.ArrayLayout
         self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
+        self._steady: bool | None = None  # None: a frame has been handed on since it was known
         self._finder: native.EpochFinder | None = None
         if native:
             self._finder = native.EpochFinder(list(self._kinds), JUMP_US, PATIENCE_US)
@@ -108,26 +109,28 @@ class BlockReader:
             row = self._finder.single()
             if row == len(table):
                 return
+            self._steady = None
             yield table.frame(row), int(times_us[row])
 
     @property
     def is_steady(self) -> bool:
         """Whether nothing waits, and the next epoch may be taken at once."""
-        source = self._assembler.source
-        return (
-            source is not None
-            and source == self._ingest.source
-            and self._assembler.is_steady(self._ingest.info_of_counts(source).sensors)
-        )
+        if self._steady is None:
+            self._steady = False
+            source = self._assembler.source
+            if source is not None and source == self._ingest.source:
+                info = self._ingest.info_of_counts(source)
+                self._steady = self._assembler.is_steady(info.sensors)
+                self._lay_out(source, info)
+        return self._steady
 
     def _block(self, table: FrameTable, times_us: Stamps, most: int) -> RegularEpochs | None:
-        source, last = self._assembler.source, self._assembler.last
-        if self._finder is None or source is None or last is None or last.sequence is None:
+        last = self._assembler.last
+        if self._finder is None or not self.is_steady or self._laid_out is None:
             return None
-        if not self.is_steady:
+        if last is None or last.sequence is None:
             return None
-        info = self._ingest.info_of_counts(source)
-        self._lay_out(source, info)
+        source, info, *_ = self._laid_out
         heard_us = self._ingest.heard_us
         found = self._finder.take(self._layout, last.time_us, last.sequence, heard_us, most)
         if found is None:

@@ -6,6 +6,7 @@ The definitions come from the dialect modules that mavgen generates. Only their 
 
 import struct
 from collections.abc import Callable
+from functools import cache
 from operator import itemgetter
 from typing import Any
 
@@ -110,19 +111,26 @@ def pack(name: str, /, **fields: Any) -> tuple[int, bytes]:
     struct.error
         If a value does not fit its field.
     """
-    message = MESSAGES[IDS[name]]
-    if fields.keys() != set(message.fieldnames):
-        raise TypeError(f"{name}: fields {sorted(fields)}, expected {sorted(message.fieldnames)}")
+    message_id, expected, layout, packer = _layout(name)
+    if fields.keys() != expected:
+        raise TypeError(f"{name}: fields {sorted(fields)}, expected {sorted(expected)}")
     values: list[Any] = []
-    for field in message.ordered_fieldnames:
+    for field, is_array in layout:
         value = fields[field]
-        if isinstance(value, str):
-            values.append(value.encode())
-        elif isinstance(value, (bytes, int, float)):
-            values.append(value)
-        else:
+        if is_array:
             values.extend(value)
-    return message.id, message.unpacker.pack(*values)
+        else:
+            values.append(value.encode() if isinstance(value, str) else value)
+    return message_id, packer.pack(*values)
+
+
+@cache
+def _layout(name: str) -> tuple[int, frozenset[str], list[tuple[str, bool]], struct.Struct]:
+    """Id and fields of a message; its fields as they are laid out, and which are arrays."""
+    message = MESSAGES[IDS[name]]
+    arrays = (length > 1 for length in message.lengths)
+    layout = list(zip(message.ordered_fieldnames, arrays, strict=True))
+    return message.id, frozenset(message.fieldnames), layout, message.unpacker
 
 
 def _position(message: Any, field: str) -> int | slice:

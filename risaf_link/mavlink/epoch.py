@@ -19,7 +19,6 @@ What the gyros read at one instant is an epoch. The rules:
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass
 from operator import sub
 from typing import Annotated, Literal, NamedTuple
 
@@ -87,8 +86,7 @@ class GyroChunk(Struct, frozen=True):  # like Frame: there are hundreds a second
         return len(self.rates_s) + len(self.forces_s)
 
 
-@dataclass(frozen=True, slots=True)
-class RegularEpochs(EpochBlock):
+class RegularEpochs(EpochBlock, frozen=True):
     """Epochs in a row, each of which is whole and follows directly on the one before."""
 
     row: NDArray[np.int64]  # (k,) of the frame that made each whole, in its table
@@ -121,7 +119,6 @@ class EpochAssembler:
         self._last_received_us: int | None = None  # likewise, by any clock
         self._last_size = 0
         self._steps_us: deque[int] = deque(maxlen=STEPS)
-        self._period_us = 0
 
     @property
     def sensors(self) -> int:
@@ -224,7 +221,7 @@ class EpochAssembler:
         self._source = chunk.source
         self._gyros, self._accels = Roster(self._parameters.sensors), Roster()
         self._steps_us.clear()
-        self._last_size = self._period_us = 0
+        self._last_size = 0
         return epochs
 
     def _since_newest(self, chunk: GyroChunk) -> tuple[int, int]:
@@ -376,18 +373,24 @@ class EpochAssembler:
             return (begun.time_us - self._last.time_us) / 1e6
         if self._last_received_us is None:
             return 0.0
-        return max(self._period_us, begun.received_us - self._last_received_us) / 1e6
+        return max(self._period_us(), begun.received_us - self._last_received_us) / 1e6
 
     def _epochs_before(self, begun: GyroChunk) -> int:
         """How many epochs are missing between the last one and this."""
         if self._last is None:
             return 0
         step_us = begun.time_us - self._last.time_us
-        by_time = max(0, round(step_us / self._period_us) - 1) if self._period_us else 0
+        period_us = self._period_us()
+        by_time = max(0, round(step_us / period_us) - 1) if period_us else 0
         if begun.sequence is None or self._last.sequence is None:
             return by_time
         by_number = (begun.sequence - self._last.sequence - 1) % 65536
         return by_number if by_number <= MAX_OPEN else min(by_number, by_time)
+
+    def _period_us(self) -> int:
+        """From epoch to epoch; 0: not known."""
+        steps_us = sorted(self._steps_us)
+        return steps_us[len(steps_us) // 2] if steps_us else 0
 
     def _end_epoch(self, begun: GyroChunk) -> None:
         if self._last is not None:
@@ -395,8 +398,6 @@ class EpochAssembler:
         self._close_steps(begun)
 
     def _close_steps(self, begun: GyroChunk) -> None:
-        if self._steps_us:
-            self._period_us = sorted(self._steps_us)[len(self._steps_us) // 2]
         self._last, self._last_received_us = begun, begun.received_us
         if self.counts["epochs"] % REVIEW == 0:
             most = self._gyros.attended.max()

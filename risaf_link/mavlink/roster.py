@@ -123,7 +123,7 @@ class Roster:
         """Hand on instants at which all sensors came, as `see`, `put`, `attend` and `close` do."""
         if not self.size:
             return
-        self.see(self.size)
+        self._seen = max(self._seen, self.size)
         self.attended += len(times_us)
         self.gone.update(dict.fromkeys(times_us, self.size))
         self._forget_old()

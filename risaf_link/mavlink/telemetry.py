@@ -171,8 +171,8 @@ def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
     q_nb, rate_b = estimate.attitude.q_nb, estimate.attitude.rate_b
     return {
         "time_boot_ms": estimate.boot_us // 1000 % 2**32,
-        **dict(zip(("q1", "q2", "q3", "q4"), q_nb, strict=True)),
-        **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rate_b, strict=True)),
+        **dict(zip(("q1", "q2", "q3", "q4"), q_nb.tolist(), strict=True)),
+        **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rate_b.tolist(), strict=True)),
         "repr_offset_q": (0.0, 0.0, 0.0, 0.0),
     }
 
