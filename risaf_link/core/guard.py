@@ -349,18 +349,12 @@ class HeadingGuard:
 
     def _rate_before(self, age: float) -> tuple[float, float, float]:
         """Rate `age` seconds ago, rad/s, body."""
-        until = self._turned_before(max(age - RATE_SPAN, 0.0))
-        since = self._turned_before(age + RATE_SPAN)
-        x, y, z, seconds = (until - since).tolist()
+        known = self._turned[: self._turns]  # the oldest stands for what is older
+        until_s = self._elapsed - max(age - RATE_SPAN, 0.0) + 1e-9
+        since_s = self._elapsed - age - RATE_SPAN + 1e-9
+        since, until = np.searchsorted(known[:, 3], (since_s, until_s), side="right").tolist()
+        x, y, z, seconds = (known[max(until - 1, 0)] - known[max(since - 1, 0)]).tolist()
         return (x / seconds, y / seconds, z / seconds) if seconds > 0.0 else (0.0, 0.0, 0.0)
-
-    def _turned_before(self, age: float) -> Floats:
-        """The rate's integral `age` seconds ago, and that time; the oldest known, at most."""
-        i = np.searchsorted(
-            self._turned[: self._turns, 3], self._elapsed - age + 1e-9, side="right"
-        )
-        entry: Floats = self._turned[max(int(i) - 1, 0)]
-        return entry
 
 
 def _is_course(motion: Motion) -> bool:

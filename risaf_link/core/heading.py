@@ -6,7 +6,7 @@ Massive Array of MEMS IMUs".
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Annotated, Literal
 
@@ -209,15 +209,15 @@ class HeadingFinder:
         previous = self._previous[0] if self._previous else None
         track = self._track(fix, time_s)
         by_track = self._parameters.source.startswith("positions") or math.isnan(fix.speed)
-        motion = Motion(
+        return Motion(
             track.speed if by_track else fix.speed,
             self._choose(fix, track, time_s),
             track.speed_std if by_track else _known(fix.speed_std, UNKNOWN_SPEED_STD),
             fix.course if fix.speed >= self._parameters.min_speed else math.nan,
             self._goes_ahead(fix),
             previous is None or _content(fix) != _content(previous),
+            self._witness.contradicts(fix, time_s),
         )
-        return replace(motion, contradicted=self._witness.contradicts(fix, time_s))
 
     def _goes_ahead(self, fix: GpsFix) -> bool:
         told = self._parameters.course_is_heading

@@ -13,6 +13,7 @@ from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingParameters, HeadingState
 from risaf_link.core.rotation import Floats, wraps, yaws_of
 from risaf_link.core.scoring import ErrorAccount, HeadingScore
+from risaf_link.core.track import Track
 
 SHORTEST_OUTAGE = 5.0  # s, of those that are found in a log
 OVERLAP = 4096  # epochs that are remembered for a reference that comes late
@@ -52,7 +53,7 @@ class Outage:
         ]
 
 
-class _Track:
+class _Yaws:
     """Yaw over the time of one clock, and the references that are to be held against it."""
 
     def __init__(self) -> None:
@@ -130,7 +131,7 @@ class Scorer:
         self._found: list[Outage] = []
         self._delay_us = round(parameters.delay * 1e6)
         self._finder = HeadingFinder(parameters)
-        self._by_boot, self._by_arrival = _Track(), _Track()
+        self._by_boot, self._by_arrival = _Yaws(), _Yaws()
         self._gathered: list[EstimateBlock] = []
         self._epochs = 0  # in them
         self._elapsed, self._boot_us = 0.0, 0  # at the last epoch
@@ -174,12 +175,14 @@ class Scorer:
         blocks, self._gathered, self._epochs = self._gathered, [], 0
         if not blocks:
             return
-        boot_us, received_us, elapsed, yaw, aligned, state = map(
+        boot_us, received_us, elapsed, state = map(
             np.concatenate, zip(*map(_columns, blocks), strict=True)
         )
+        track = Track(np.concatenate([block.track.values for block in blocks]))
+        yaw, aligned = yaws_of(track.q_nb), track.aligned
         self._follow_outages(elapsed, state)
-        for track, time_us in ((self._by_boot, boot_us), (self._by_arrival, received_us)):
-            for errors in track.add(np.array([time_us, yaw, elapsed])[:, aligned]):
+        for yaws, time_us in ((self._by_boot, boot_us), (self._by_arrival, received_us)):
+            for errors in yaws.add(np.array([time_us, yaw, elapsed])[:, aligned]):
                 self._account(*errors)
 
     def _follow_outages(self, elapsed: Floats, state: NDArray[np.int64]) -> None:
@@ -206,9 +209,7 @@ class Scorer:
 
 
 def _columns(block: EstimateBlock) -> tuple[NDArray[Any], ...]:
-    track = block.track
-    times = block.boot_us, block.received_us, block.elapsed
-    return *times, yaws_of(track.q_nb), track.aligned, block.heading.state
+    return block.boot_us, block.received_us, block.elapsed, block.heading.state
 
 
 def in_degrees(score: HeadingScore | None) -> dict[str, float | int | None]:
