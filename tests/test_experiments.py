@@ -5,6 +5,8 @@ import json
 import math
 import os
 import re
+import signal
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -34,6 +36,16 @@ def cases(seeds=3):
 
 def call(*arguments):
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+class Endless(Struct, frozen=True):
+    """A case that says that it runs, and never ends."""
+
+    key: str = "endless"
+
+    def run(self):
+        print("running", flush=True)
+        signal.pause()
 
 
 class Deadly(Struct, frozen=True):
@@ -71,6 +83,19 @@ def test_other_parameters_are_another_case():
         Case("circle", 1, ("mean",), (), own=(("a", "x = 2"),)).key,
     }
     assert len(keys) == 6
+
+
+def test_workers_end_with_a_sweep_that_is_killed(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from test_experiments import Endless; "
+        "from risaf_link.sweep import Sweep; Sweep(Path(sys.argv[1]), 1).run([Endless()], '')"
+    )
+    here = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    with subprocess.Popen(command, env=here, stdout=subprocess.PIPE, text=True) as sweep:
+        assert sweep.stdout.readline() == "running\n"
+        sweep.kill()
+        assert not sweep.stdout.read()  # the worker had the pipe open as well
 
 
 @pytest.mark.parametrize("workers", [1, 2])
