@@ -72,6 +72,7 @@ class Pipeline:
         self._calibration = Calibration(calibration) if calibration else None
         self._clock = VehicleClock(own[1])
         self._parameters = p
+        self._delay = 0.0  # s, of the samples
         self._estimator = Estimator(p.fusion, p.attitude, p.heading)
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
@@ -84,7 +85,7 @@ class Pipeline:
         `restart`, and so does what is said of the filter's start.
         """
         p = self._parameters = parameters
-        self._estimator.configure(p.fusion, p.attitude, p.heading)
+        self._set_delay(self._delay)
         self._finder.configure(p.heading)
         self._monitor.configure(p.heading)
 
@@ -161,16 +162,27 @@ class Pipeline:
         rates_b, forces_b = epochs.rates_b, epochs.forces_b
         if self._calibration:
             rates_b, forces_b = self._calibration.apply(rates_b, forces_b)
+        delay = self.ingest.delay_of(self.assembler.source)
+        if delay != self._delay:
+            self._set_delay(delay)
         track, elapsed = self._estimator.advance(epochs.dt, rates_b, forces_b)
         return EstimateBlock(
             epochs.time_us,
             epochs.received_us,
             self._clock.boot_times(epochs.time_us, epochs.received_us),
+            self._clock.delay_us,
             elapsed,
             track,
             self._monitor.advance(elapsed, track.aligned),
             partial(self._array_status, sensors),
         )
+
+    def _set_delay(self, delay: float) -> None:
+        """Take samples for so many seconds old: a fix is less late than against present ones."""
+        p, self._delay = self._parameters, delay
+        self._clock.delay_us = round(delay * 1e6)
+        heading = structs.replace(p.heading, delay=max(p.heading.delay - delay, 0.0))
+        self._estimator.configure(p.fusion, p.attitude, heading)
 
     def _correct(self, fix: GpsFix) -> None:
         """Correct the attitude by a GPS fix."""

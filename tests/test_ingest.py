@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import signal
 from wire import ARRAY, AUTOPILOT, FORCES, SERVICE, array, debug_array, frame, imu, info
 
 from risaf_link.core.heading import GpsFix
@@ -336,6 +337,34 @@ class TestWhoIsListenedTo:
         assert reader.decode(imu("RAW_IMU", 2, sender=(2, 1)), 0) is None
 
 
+HEARTBEAT = {"base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3}
+
+
+class TestDelay:
+    @pytest.mark.parametrize(
+        ("vehicle_type", "autopilot", "hertz"), [(10, 3, 4.0), (11, 3, 4.0), (2, 3, 20.0)]
+    )
+    def test_ardupilots_gyros_are_late_by_its_low_pass(self, vehicle_type, autopilot, hertz):
+        beat = frame("HEARTBEAT", type=vehicle_type, autopilot=autopilot, **HEARTBEAT)
+        reader = ingest(beat)
+        source = reader.decode(imu("RAW_IMU", 1), 0).source
+        low_pass = signal.butter(2, math.tau * hertz, analog=True)
+        _, response = signal.freqs(*low_pass, worN=[0.0, 0.01])
+        assert reader.delay_of(source) == pytest.approx(-np.diff(np.angle(response))[0] / 0.01)
+
+    @pytest.mark.parametrize("autopilot", [12, 8])
+    def test_those_of_others_and_of_arrays_are_not(self, autopilot):
+        reader = ingest(frame("HEARTBEAT", type=10, autopilot=autopilot, **HEARTBEAT), info())
+        assert reader.delay_of(reader.decode(imu("RAW_IMU", 1), 0).source) == 0.0
+        reader = ingest(frame("HEARTBEAT", type=10, autopilot=3, **HEARTBEAT), info())
+        assert reader.delay_of(reader.decode(array(1, [(1, 1, 1)]), 0).source) == 0.0
+        assert reader.delay_of(None) == 0.0
+
+    def test_the_configuration_knows_better(self):
+        reader = ingest(info(), delay=0.02)
+        assert reader.delay_of(reader.decode(array(1, [(1, 1, 1)]), 0).source) == 0.02
+
+
 # Fields of one fix in the sender's units, and what it is in ours.
 POSITION = {"lat": 302217000, "lon": -348012000}
 RAW_FIX = {"time_usec": 5, "fix_type": 3, **POSITION, "vel": 1234, "cog": 9000}
@@ -401,8 +430,7 @@ class TestGps:
     )
     def test_what_hovers_or_flies_says_so_by_its_heartbeat(self, vehicle_type, autopilot, heads):
         service = ingest()
-        heartbeat = {"base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3}
-        service.decode(frame("HEARTBEAT", type=vehicle_type, autopilot=autopilot, **heartbeat), 0)
+        service.decode(frame("HEARTBEAT", type=vehicle_type, autopilot=autopilot, **HEARTBEAT), 0)
         assert service.decode(frame("GPS_RAW_INT", **RAW_FIX), 0).course_is_heading is heads
 
     def test_gps_input_has_velocity_and_accuracies_in_si_units(self):

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as public
 from vehicle import Vehicle
+from wire import imu
 
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.heading import HeadingState
-from risaf_link.core.rotation import yaw_of
+from risaf_link.core.rotation import wrap, yaw_of
 from risaf_link.mavlink import risaf
+from risaf_link.mavlink.epoch import ArrayParameters
 from risaf_link.mavlink.frame import Frame, FrameParser
 from risaf_link.mavlink.telemetry import DEFAULT_RATES, Emitter
 from risaf_link.pipeline import Pipeline, PipelineParameters
@@ -20,6 +22,8 @@ from risaf_link.sim.scenario import BOOT_US, scenario
 from risaf_link.sim.stream import frames
 
 OWN = (1, 191)
+ROVER = {"type": 10, "autopilot": 3, "base_mode": 0, "custom_mode": 0, "system_status": 4}
+ROVER |= {"mavlink_version": 3}
 PERIOD_US = 10_000
 
 
@@ -130,6 +134,36 @@ def test_an_epoch_without_any_reading_loses_no_time(drive):
     assert np.isnan(blind.fused.rate_b).all()
     after = drive.go(0.01, rate_z=rate)
     assert after.heading.yaw - before.heading.yaw == pytest.approx(0.02 * rate, rel=0.01)
+
+
+def test_estimates_are_stamped_when_late_samples_were_taken_and_never_go_back(drive):
+    stamps = []
+    for k in range(200):
+        if k == 100:
+            drive.take(drive.vehicle.frame("HEARTBEAT", **ROVER))
+        drive.time_us += PERIOD_US
+        stamps += [e.boot_us for e in drive.take(imu("RAW_IMU", drive.time_us))]
+    assert stamps[90] % PERIOD_US == 0
+    assert stamps[-1] == drive.time_us - 56_270
+    assert stamps == sorted(stamps)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05])
+def test_yaw_is_that_of_the_stamp_whatever_the_delay_of_the_samples(delay):
+    rate = math.radians(20)
+    drive = Drive(PipelineParameters(array=ArrayParameters(delay=delay)))
+    courses = [1.0] * 2000 + [1.0 + rate * 0.01 * k for k in range(2000)]
+    late_gyro, late_fix = round(delay * 100), 11
+    for k in range(20, 3900):
+        drive.time_us += PERIOD_US
+        if k % 20 == 0:
+            drive.take(drive.vehicle.fix(drive.time_us, courses[k - late_fix]))
+        turns = courses[k - late_gyro] > 1.0
+        (estimate,) = drive.take(drive.vehicle.epoch(drive.time_us, (0, 0, rate * turns)))
+    taken = k - (drive.time_us - estimate.boot_us) / PERIOD_US
+    assert taken == k - late_gyro
+    error = wrap(estimate.heading.yaw - courses[round(taken)])
+    assert abs(error) < math.radians(0.1)
 
 
 def test_nothing_that_the_service_sent_itself_is_taken_for_input(drive):

@@ -193,7 +193,19 @@ class TestRecordings:
         (outage,) = replay.summary()["outages"]
         assert outage["reference"] == "truth"
         assert (outage["start_s"], outage["end_s"]) == pytest.approx((73.3, 229.4), abs=0.2)
-        assert 0 < outage["rmse_deg"] < 15
+        assert 0 < outage["rmse_deg"] < 2.04  # that of EKF3 with its compass
+
+    @pytest.mark.parametrize("log", sorted(FIXTURES.glob("*.tlog")), ids=lambda path: path.stem)
+    def test_the_stated_deviation_of_yaw_is_honest(self, log):
+        replay = Replay(Config(), log, Selection(), keep_trace=True)
+        blocks = list(replay.blocks())
+        elapsed = np.concatenate([block.elapsed for block in blocks])
+        stds = np.concatenate([block.track.yaw_std for block in blocks])
+        _, times, errors = zip(*replay.scorer.trace, strict=True)
+        times, errors = np.concatenate(times), np.concatenate(errors)
+        ratios = np.abs(errors) / np.interp(times, elapsed, stds)
+        assert np.mean(ratios < 3.0) > 0.997
+        assert np.sqrt(np.mean(ratios**2)) < 1.5
 
 
 def a_log(path: Path, *orders: Frame, system: int = 1) -> Path:

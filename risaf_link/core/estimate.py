@@ -36,7 +36,7 @@ class Estimate:
     time_us : int
         As the samples were stamped.
     boot_us : int
-        The same instant on the vehicle's boot clock.
+        The instant that it tells of, on the vehicle's boot clock.
     elapsed : float
         Seconds since the first epoch, whatever the clocks did.
     """
@@ -74,6 +74,7 @@ class EstimateBlock(Struct, frozen=True):
     time_us: NDArray[np.int64]  # (k,)
     received_us: NDArray[np.int64]  # (k,) when what made each of them possible came
     boot_us: NDArray[np.int64]  # (k,)
+    delay_us: int  # by how much the samples lag behind their stamps; boot_us is without it
     elapsed: Floats  # (k,) s
     track: Track
     heading: HeadingTrack

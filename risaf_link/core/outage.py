@@ -129,12 +129,12 @@ class Scorer:
         self._keep_trace = keep_trace
         self._withheld = outages
         self._found: list[Outage] = []
-        self._delay_us = round(parameters.delay * 1e6)
+        self._fix_delay_us = round(parameters.delay * 1e6)
         self._finder = HeadingFinder(parameters)
         self._by_boot, self._by_arrival = _Yaws(), _Yaws()
         self._gathered: list[EstimateBlock] = []
         self._epochs = 0  # in them
-        self._elapsed, self._boot_us = 0.0, 0  # at the last epoch
+        self._elapsed, self._now_us = 0.0, 0  # at the last epoch, when it came
 
     @property
     def outages(self) -> list[Outage]:
@@ -148,7 +148,8 @@ class Scorer:
 
     def take_estimates(self, block: EstimateBlock) -> None:
         """Take the next estimates."""
-        self._elapsed, self._boot_us = float(block.elapsed[-1]), int(block.boot_us[-1])
+        self._elapsed = float(block.elapsed[-1])
+        self._now_us = int(block.boot_us[-1]) + block.delay_us
         self._gathered.append(block)
         self._epochs += len(block)
         if self._epochs >= GATHERED:
@@ -162,7 +163,7 @@ class Scorer:
         """Take a fix that the filter did not get."""
         heading = self._finder.take(fix, self._elapsed).heading
         if heading:
-            valid_us = self._boot_us - self._delay_us - round(heading.age * 1e6)
+            valid_us = self._now_us - self._fix_delay_us - round(heading.age * 1e6)
             self._by_boot.expect("gps", np.array([valid_us]), np.array([heading.heading]))
 
     def finish(self) -> None:
@@ -175,13 +176,13 @@ class Scorer:
         blocks, self._gathered, self._epochs = self._gathered, [], 0
         if not blocks:
             return
-        boot_us, received_us, elapsed, state = map(
+        boot_us, taken_us, elapsed, state = map(
             np.concatenate, zip(*map(_columns, blocks), strict=True)
         )
         track = Track(np.concatenate([block.track.values for block in blocks]))
         yaw, aligned = yaws_of(track.q_nb), track.aligned
         self._follow_outages(elapsed, state)
-        for yaws, time_us in ((self._by_boot, boot_us), (self._by_arrival, received_us)):
+        for yaws, time_us in ((self._by_boot, boot_us), (self._by_arrival, taken_us)):
             for errors in yaws.add(np.array([time_us, yaw, elapsed])[:, aligned]):
                 self._account(*errors)
 
@@ -209,7 +210,8 @@ class Scorer:
 
 
 def _columns(block: EstimateBlock) -> tuple[NDArray[Any], ...]:
-    return block.boot_us, block.received_us, block.elapsed, block.heading.state
+    taken_us = block.received_us - block.delay_us
+    return block.boot_us, taken_us, block.elapsed, block.heading.state
 
 
 def in_degrees(score: HeadingScore | None) -> dict[str, float | int | None]:

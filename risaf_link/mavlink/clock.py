@@ -73,10 +73,16 @@ class VehicleClock:
     ----------
     component : int
         That of ours which asks with TIMESYNC.
+
+    Attributes
+    ----------
+    delay_us : int
+        By how much samples are older than their stamps say.
     """
 
     def __init__(self, component: int = 191) -> None:
         self._component = component
+        self.delay_us = 0
         self._autopilot: tuple[int, int] | None = None
         self._vehicle, self._array = _Lead(), _Lead()
         self._synchronised = Synchronised()
@@ -108,14 +114,15 @@ class VehicleClock:
         return max(received_us + self._array.lead_us + offset_us, 0)
 
     def boot_us(self, time_us: int, received_us: int) -> int:
-        """Time of an epoch, which has just been received, on the vehicle's clock."""
+        """When the samples of an epoch were taken, which has just been received."""
         if self._array.note(time_us, received_us):
             self._vehicle, self._synchronised = _Lead(), Synchronised()
         lead_us = self._lead_of_vehicle(received_us)
         if lead_us is not None and self._array.lead_us is not None:
             self._offset_us = lead_us - self._array.lead_us
         is_same = abs(self._offset_us) < SAME_CLOCK_US
-        return self._steady(time_us if is_same else max(time_us + self._offset_us, 0))
+        stamp_us = time_us if is_same else time_us + self._offset_us
+        return self._steady(max(stamp_us - self.delay_us, 0))
 
     def boot_times(self, time_us: Times, received_us: Times) -> Times:
         """Do what `boot_us` does, for k epochs that were received one after another."""
@@ -140,7 +147,8 @@ class VehicleClock:
             offsets_us = self._vehicle.lead_us - leads_us
         self._offset_us = int(offsets_us[-1])
         same = np.abs(offsets_us) < SAME_CLOCK_US
-        stamps = np.where(same, time_us, np.maximum(time_us + offsets_us, 0))
+        stamps_us = np.where(same, time_us, time_us + offsets_us)
+        stamps: Times = np.maximum(stamps_us - self.delay_us, 0)
         if (stamps[1:] < stamps[:-1]).any() or stamps[0] < (self._last_us or 0):
             return np.array([self._steady(stamp) for stamp in stamps.tolist()])
         self._last_us = int(stamps[-1])

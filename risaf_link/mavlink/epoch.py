@@ -48,6 +48,7 @@ class ArrayParameters(Struct, frozen=True, forbid_unknown_fields=True):
     id: Annotated[int, Meta(ge=0, le=255)] | None = None
     sensors: Annotated[int, Meta(ge=0, le=MAX_SENSORS)] = 0
     max_wait: Annotated[float, Meta(ge=0, le=1)] = 0.025
+    delay: Annotated[float, Meta(ge=0, le=1)] | None = None
     gyro_scale: Annotated[float, Meta(ge=0)] = 0.0
     gyro_range: Annotated[float, Meta(ge=0)] = 0.0
     calibration: str = ""

@@ -42,6 +42,9 @@ SIDEWAYS = frozenset({1, 2, 3, 4, 7, 8, *range(12, 18), *range(19, 26), 28, 29, 
 Aeroplanes, rotorcraft, airships, balloons, submarines, kites, parafoils. What is not listed, rovers
 and boats among it, goes where it points.
 """
+ARDUPILOT = 3  # MAV_AUTOPILOT
+ON_THE_GROUND = frozenset({10, 11})  # MAV_TYPE of rovers and boats
+GROUND_FILTER, OTHER_FILTER = 4.0, 20.0  # Hz; INS_GYRO_FILTER of ArduPilot, by default
 STALE_FIX_US = 10_000_000  # a fix that is older by less came late; by more, the clock has jumped
 
 Key = TypeVar("Key", bound=Hashable)
@@ -108,6 +111,7 @@ class Ingest:
         self._autopilot: Source | None = None  # whose they are
         self._last_fixes: dict[Hashable, tuple[int, bytes]] = {}
         self._sideways: dict[int, bool] = {}  # vehicles: whether they go where they do not point
+        self._filters: dict[int, float] = {}  # vehicles whose gyros are filtered: by so many Hz
         self._readers: dict[int, Callable[[Frame, int], GyroChunk | GpsFix | None]] = {
             IDS["IMU_ARRAY_INFO"]: self._array_info,
             IDS["GYRO_ARRAY"]: self._gyro_array,
@@ -149,6 +153,16 @@ class Ingest:
     def info_of_counts(self, source: Source) -> ArrayInfo:
         """What the counts of an array mean, by what it says or, else, by the configuration."""
         return self.info(source) or self._assumed_info()
+
+    def delay_of(self, source: Source | None) -> float:
+        """By how much an array's samples lag behind their stamps, s, as told or as is usual.
+
+        A second-order Butterworth filter delays what changes slowly by sqrt(2) / (2 pi f_c).
+        """
+        if self._parameters.delay is not None:
+            return self._parameters.delay
+        cutoff = self._filters.get(source.system) if source and source.encoding == "IMU" else None
+        return math.sqrt(2.0) / (math.tau * cutoff) if cutoff else 0.0
 
     @property
     def message_ids(self) -> frozenset[int]:
@@ -328,6 +342,9 @@ class Ingest:
         vehicle_type, autopilot = _HEARTBEAT(frame.payload)
         if autopilot != NO_AUTOPILOT:
             _remember(self._sideways, frame.system, vehicle_type in SIDEWAYS)
+        if autopilot == ARDUPILOT:
+            cutoff = GROUND_FILTER if vehicle_type in ON_THE_GROUND else OTHER_FILTER
+            _remember(self._filters, frame.system, cutoff)
 
     def _gps(self, frame: Frame, received_us: int) -> GpsFix | None:
         name = cast("GpsMessage", name_of(frame.message_id))
