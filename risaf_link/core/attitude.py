@@ -86,7 +86,7 @@ class AttitudeState:
     pitch_std: float  # rad
     yaw_std: float  # rad; pi while yaw is not known
     aligned: bool  # yaw has been set by a heading
-    resets: int  # how often yaw was set
+    resets: int  # how often yaw was set, also by filters before this one
 
     @property
     def euler(self) -> tuple[float, float, float]:
