@@ -51,8 +51,8 @@ class Px4:
         if not finite(*q) or abs(1.0 - norm) > 1e-5 or not any(q):
             self.refused.append("q")
             return
-        floor = self.eva_noise**2
         told = [m.pose_covariance[i] for i in (15, 18, 20)] if m.estimator_type != NAIVE else [NAN]
+        floor = max(self.eva_noise**2, self.eva_noise, 0.01**2)  # as it is there: not squared
         variance = max(floor, told[2]) if finite(*told) else floor
         if self._newest_us is not None and m.time_usec < self._newest_us + MIN_INTERVAL_US:
             self.refused.append("too fast")
@@ -114,10 +114,7 @@ class ArduPilot:
         angle_error = min(max(angle_error, self.viso_yaw_noise), 1.5)
         self.position_errors.add(min(max(position_error, self.viso_pos_noise), 100.0))
         self._heard_ms = now_ms
-        if not finite(m.vx, m.vy, m.vz):
-            pass  # writeExtNavVelData returns
-        else:
-            self.velocities += 1
+        self.velocities += not any(map(math.isnan, (m.vx, m.vy, m.vz)))
         if m.quality < self.viso_qual_min:
             self.refused.append("quality")
             return

@@ -3,6 +3,7 @@
 The rules are in `autopilots`; pymavlink reads the messages.
 """
 
+import io
 import math
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from autopilots import ArduPilot, Px4, yaw_of
 from hypothesis import given
 from hypothesis import strategies as st
 from network import OWN, Network, acks, of, public
+from streams import recording
 from vehicle import Vehicle
 from wire import frame
 
@@ -20,7 +22,9 @@ from risaf_link.errors import ConfigError
 from risaf_link.mavlink.odometry import PROFILES, quality_of
 from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.telemetry import DEFAULT_RATES, Emitter
+from risaf_link.mavlink.tlog import TlogReader
 from risaf_link.pipeline import Pipeline
+from risaf_link.replay import OutputLog, Replay, Selection
 
 ODOMETRY = 331
 ACCEPTED, REJECTED = 0, 1
@@ -152,7 +156,7 @@ class TestPx4:
         assert len(pilot.fused) == len(feed.told) - 1
         _, yaw, variance = pilot.fused[-1]
         assert yaw == pytest.approx(feed.last.attitude.euler[2], abs=1e-6)
-        assert variance == pytest.approx(0.1**2)  # its floor: we know better
+        assert variance == 0.1  # its floor, rad^2: we know better
 
     def test_it_aligns_a_vehicle_without_a_compass(self, feed):
         pilot = received_by(Px4(yaw_aligned=False), received(feed))
@@ -172,14 +176,22 @@ class TestPx4:
     def test_in_an_outage_it_goes_on_with_a_variance_that_grows(self, feed):
         feed.go(20, course=1.0)
         out = feed.go(60, rate=0.02)
-        pilot = received_by(Px4(eva_noise=1e-4), feed.told)
+        pilot = received_by(Px4(), feed.told)
         assert (pilot.refused, pilot.events) == ([], ["started"])
-        variances = [variance for *_, variance in pilot.fused[-len(out) :]]
+        variances = [m.pose_covariance[20] for m in out]
         assert all(np.diff(variances[::300]) > 0)  # from ten seconds to ten seconds
         assert variances[-1] > 2 * variances[0]
         assert variances[-1] == pytest.approx(feed.last.attitude.yaw_std**2, rel=1e-3)
         qualities = [m.quality for m in out]
         assert qualities == sorted(qualities, reverse=True)
+
+    def test_a_heading_worse_than_the_floor_is_told_to_be_so(self):
+        pilot = Px4()
+        for k in range(2):
+            attitude = replace(ESTIMATE.attitude, yaw_std=0.5)
+            later = replace(ESTIMATE, attitude=attitude, boot_us=ESTIMATE.boot_us + k * 33_000)
+            received_by(pilot, [at_once(later)])
+        assert pilot.fused[-1][2] == pytest.approx(0.25)
 
     def test_where_yaw_is_set_anew_the_counter_steps_with_it_and_no_sooner(self, feed):
         feed.go(12, course=1.0)
@@ -307,3 +319,22 @@ class TestConfiguration:
         load(None, [key])
         with pytest.raises(ConfigError, match=r"gps\.messages: found GLOBAL_POSITION_INT"):
             load(None, [key, "gps.messages=[GPS_RAW_INT, GLOBAL_POSITION_INT]"])
+
+
+def test_a_replay_of_ardupilots_log_tells_what_ardupilot_would_use():
+    config = load(None, ["emit={ODOMETRY: 20}"])
+    replay = Replay(config, recording("rover_sitl_fixture.tlog"), Selection())
+    file = io.BytesIO()
+    output = OutputLog(config, file, replay.identity)
+    for block in replay.blocks(singly=True):
+        output.write(block)
+    decoder = public.MAVLink(None)
+    logged = [decoder.parse_buffer(each.frame.raw)[0] for each in TlogReader([file.getvalue()])]
+    messages = of(logged, "ODOMETRY")
+    assert {(m.get_srcSystem(), m.get_srcComponent()) for m in messages} == {OWN}
+    pilot = received_by(ArduPilot(), messages)
+    assert not pilot.refused
+    arrivals = np.array([now_ms for now_ms, *_ in pilot.used])
+    assert np.diff(arrivals).max() <= 70  # the samples of this log come at 50 Hz
+    seconds = (arrivals[-1] - arrivals[0]) / 1e3
+    assert len(arrivals) == pytest.approx(20 * seconds, abs=2)
