@@ -5,6 +5,7 @@ The rules are in `autopilots`; pymavlink reads the messages.
 
 import io
 import math
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -94,6 +95,14 @@ def aligned_estimate():
 
 
 ESTIMATE = aligned_estimate()
+
+
+def with_attitude(later_us=0, **changes):
+    """The estimate with another attitude, and some time later."""
+    estimate = copy(ESTIMATE)
+    attitude = replace(ESTIMATE.attitude, **changes)
+    vars(estimate).update(boot_us=ESTIMATE.boot_us + later_us, attitude=attitude)
+    return estimate
 
 
 class TestWhatIsSent:
@@ -188,9 +197,7 @@ class TestPx4:
     def test_a_heading_worse_than_the_floor_is_told_to_be_so(self):
         pilot = Px4()
         for k in range(2):
-            attitude = replace(ESTIMATE.attitude, yaw_std=0.5)
-            later = replace(ESTIMATE, attitude=attitude, boot_us=ESTIMATE.boot_us + k * 33_000)
-            received_by(pilot, [at_once(later)])
+            received_by(pilot, [at_once(with_attitude(k * 33_000, yaw_std=0.5))])
         assert pilot.fused[-1][2] == pytest.approx(0.25)
 
     def test_where_yaw_is_set_anew_the_counter_steps_with_it_and_no_sooner(self, feed):
@@ -254,8 +261,7 @@ class TestArduPilot:
         assert 30 <= healthy.index(True) <= 33
 
     def test_a_heading_worse_than_the_floor_is_told_to_be_so(self):
-        attitude = replace(ESTIMATE.attitude, yaw_std=0.8)
-        message = at_once(replace(ESTIMATE, attitude=attitude), "ardupilot")
+        message = at_once(with_attitude(yaw_std=0.8), "ardupilot")
         ((_, _, sigma),) = received_by(ArduPilot(), [message]).used
         assert sigma == pytest.approx(0.8 ** (4 / 3), rel=1e-3)  # by its cube root of squares
 
@@ -292,8 +298,7 @@ class TestArduPilot:
     st.floats(0.9999, 1.0001),
 )
 def test_no_rounding_takes_the_quaternion_out_of_px4s_tolerance(q, norm):
-    attitude = replace(ESTIMATE.attitude, q_nb=np.array(q) / np.linalg.norm(q) * norm)
-    message = at_once(replace(ESTIMATE, attitude=attitude))
+    message = at_once(with_attitude(q_nb=np.array(q) / np.linalg.norm(q) * norm))
     assert not received_by(Px4(), [message]).refused
 
 
@@ -305,8 +310,7 @@ def test_quality_is_a_percentage_that_falls_with_the_deviation(one, other):
 
 
 def test_the_counter_is_a_byte():
-    attitude = replace(ESTIMATE.attitude, resets=257)
-    assert at_once(replace(ESTIMATE, attitude=attitude)).reset_counter == 1
+    assert at_once(with_attitude(resets=257)).reset_counter == 1
 
 
 class TestConfiguration:
