@@ -178,9 +178,16 @@ class TestPx4:
         assert feed.last.boot_us - message.time_usec < 40_000
         assert message.q == pytest.approx(feed.last.attitude.q_nb, abs=0.02)
         assert message.yawspeed == pytest.approx(0.3, abs=1e-3)
-        std = feed.last.attitude
-        told = [message.pose_covariance[i] for i in (15, 18, 20)]
-        assert np.sqrt(told) == pytest.approx((std.roll_std, std.pitch_std, std.yaw_std), rel=0.01)
+
+    def test_the_covariance_is_that_of_the_attitude(self):
+        message = at_once(ESTIMATE)
+        whole = np.zeros((6, 6))
+        whole[np.triu_indices(6)] = message.pose_covariance
+        attitude = ESTIMATE.attitude
+        std = (attitude.roll_std, attitude.pitch_std, attitude.yaw_std)
+        assert np.sqrt(whole.diagonal()[3:]) == pytest.approx(std, rel=1e-6)
+        assert [*whole[3, 4:], whole[4, 5]] == pytest.approx(attitude.common, rel=1e-5)
+        assert not whole[:3, 3:].any()
 
     def test_in_an_outage_it_goes_on_with_a_variance_that_grows(self, feed):
         feed.go(20, course=1.0)

@@ -51,8 +51,8 @@ def quality_of(yaw_std: float) -> int:
 def odometry(estimate: Estimate, profile: Profile) -> dict[str, Any]:
     """Fields of ODOMETRY; where no sensor is behind the rate, the quality is -1: failed."""
     attitude = estimate.attitude
-    variances = np.square((attitude.roll_std, attitude.pitch_std, attitude.yaw_std))
-    pose = np.diag([*[POSITION_VARIANCE] * 3, *variances])
+    pose = np.diag([POSITION_VARIANCE] * 6)
+    pose[3:, 3:] = attitude.angle_covariance
     return {
         "time_usec": estimate.boot_us,
         "frame_id": profile.frame,

@@ -195,14 +195,12 @@ def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
 
 
 def _attitude_quaternion_cov(estimate: Estimate) -> dict[str, Any]:
-    """The variances of roll, pitch and yaw; what they have in common is not told."""
     attitude = estimate.attitude
-    variances = np.square((attitude.roll_std, attitude.pitch_std, attitude.yaw_std))
     return {
         "time_usec": estimate.boot_us,
         "q": attitude.q_nb,
         **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), attitude.rate_b, strict=True)),
-        "covariance": np.diag(variances).ravel(),
+        "covariance": attitude.angle_covariance.ravel(),
     }
 
 
