@@ -5,6 +5,7 @@ The rules are in `autopilots`; pymavlink reads the messages.
 
 import io
 import math
+import re
 from copy import copy
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from autopilots import ArduPilot, Px4, yaw_of
 from hypothesis import given
 from hypothesis import strategies as st
 from network import OWN, Network, acks, of, public
-from streams import recording
+from streams import ROOT, recording
 from vehicle import Vehicle
 from wire import frame
 
@@ -52,7 +53,9 @@ class Feed(Network):
             self.beat(autopilot)
 
     def beat(self, autopilot, system=1):
-        self.take(frame("HEARTBEAT", (system, 1), type=10, autopilot=autopilot), PEER)
+        beat = frame("HEARTBEAT", (system, 1), type=10, autopilot=autopilot)
+        self.pipeline.step(beat, self.time_us)
+        self.take(beat, PEER)
 
     def go(self, seconds, course=None, rate=0.0):
         """Drive on; with a course there is a fix five times a second. What was heard in it."""
@@ -189,6 +192,16 @@ class TestPx4:
         assert [*whole[3, 4:], whole[4, 5]] == pytest.approx(attitude.common, rel=1e-5)
         assert not whole[:3, 3:].any()
 
+    def test_its_stamps_are_on_the_clock_that_answers_to_timesync_show(self, feed):
+        boot_ms = feed.time_us // 1000 + 500_000  # the array counts a time of its own
+        feed.pipeline.step(frame("SYSTEM_TIME", time_boot_ms=boot_ms), feed.time_us)
+        (*_, message) = feed.go(3, course=1.0)
+        feed.now_us = feed.time_us
+        (answer,) = feed.take(frame("TIMESYNC", ts1=1), PEER)
+        behind_us = answer.tc1 // 1000 - message.time_usec
+        assert 0 <= behind_us < 40_000  # since that message was sent
+        assert message.time_usec // 1000 - boot_ms in range(2960, 3001)
+
     def test_in_an_outage_it_goes_on_with_a_variance_that_grows(self, feed):
         feed.go(20, course=1.0)
         out = feed.go(60, rate=0.02)
@@ -321,6 +334,16 @@ def test_the_counter_is_a_byte():
 
 
 class TestConfiguration:
+    @pytest.mark.parametrize(("page", "rate"), [("px4.md", 30), ("ardupilot.md", 20)])
+    def test_that_of_the_page_feeds_the_autopilot_alone(self, page, rate, tmp_path):
+        (text,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / page).read_text(), re.DOTALL)
+        path = tmp_path / "vehicle.yaml"
+        path.write_text(text)
+        config = load(path)
+        fed = {link.name: link.emit.get("ODOMETRY") for link in config.links if link.emit}
+        assert fed == {"autopilot": rate}
+        assert "ODOMETRY" not in config.emit
+
     def test_a_profile_that_is_none_is_refused(self):
         with pytest.raises(ConfigError, match=r"mavlink\.odometry: found 'apm', expected one of"):
             load(None, ["mavlink.odometry=apm"])
