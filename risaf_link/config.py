@@ -19,6 +19,8 @@ from risaf_link.core.tunable import Tunable
 from risaf_link.errors import ConfigError, LinkError
 from risaf_link.links import open_link
 from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.identity import Identity
+from risaf_link.mavlink.odometry import ProfileName
 from risaf_link.mavlink.requests import RequestedRates
 from risaf_link.mavlink.signing import SigningParameters
 from risaf_link.mavlink.telemetry import DEFAULT_RATES, Rates
@@ -27,7 +29,7 @@ from risaf_link.pipeline import PipelineParameters
 Id = Annotated[int, Meta(ge=1, le=255)]
 RATE_NAMES = (
     *("RATE_ATT_QUAT", "RATE_GPS_HDG", "RATE_ARRAY", "RATE_HEALTH", "RATE_REASON"),
-    *("RATE_ATT_COV", "RATE_EST_STATUS", "RATE_NAMED"),
+    *("RATE_ATT_COV", "RATE_EST_STATUS", "RATE_NAMED", "RATE_ODOMETRY"),
 )
 """Of the parameters that set the rates of `Message`s, in their order."""
 
@@ -37,6 +39,7 @@ class MavlinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
     system_id: Id | None = None  # None: that of the one autopilot that is heard; 1 before
     component_id: Id = 191
+    odometry: ProfileName = "auto"  # which autopilot ODOMETRY is for; auto: as its HEARTBEAT tells
     parameters: str = ""  # file that keeps what was set over MAVLink
 
 
@@ -68,6 +71,12 @@ class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
         return self.mavlink.system_id or 1, self.mavlink.component_id
 
 
+def identity_of(config: Config) -> Identity:
+    """Whom a configuration makes us."""
+    mavlink = config.mavlink
+    return Identity(*config.own, mavlink.system_id is None, mavlink.odometry)
+
+
 def load(path: Path | None, settings: Iterable[str] = ()) -> Config:
     """Read a configuration.
 
@@ -95,6 +104,7 @@ def load(path: Path | None, settings: Iterable[str] = ()) -> Config:
     except msgspec.ValidationError as error:
         raise ConfigError(where + _explain(error, tree)) from None
     _check_links(where, config.links)
+    _check_feeding(where, config)
     return config
 
 
@@ -147,6 +157,16 @@ def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
             raise ConfigError(f"{where}links.{i}.url: {error}") from None
         if link.signing:
             _check_signing(f"{where}links.{i}.signing", link)
+
+
+def _check_feeding(where: str, config: Config) -> None:
+    """Refuse to tell an autopilot the heading that it tells us."""
+    emitted = {*config.emit, *(name for link in config.links for name in link.emit or {})}
+    if "ODOMETRY" in emitted and "GLOBAL_POSITION_INT" in config.gps.messages:
+        raise ConfigError(
+            f"{where}gps.messages: found GLOBAL_POSITION_INT, the autopilot's own estimate, "
+            "expected none where ODOMETRY is emitted: it would hear itself"
+        )
 
 
 def _check_signing(where: str, link: LinkParameters) -> None:

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from risaf_link.config import Config, load_calibration
+from risaf_link.config import Config, identity_of, load_calibration
 from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.heading import GpsFix
@@ -56,14 +56,14 @@ class OutputLog:
 
     def __init__(self, config: Config, file: BinaryIO, identity: Identity | None = None) -> None:
         self._file = file
-        self._identity = identity
+        self._identity = identity or identity_of(config)
         self._emitter = Emitter(config.emit, *config.own)
         self._second = -1
 
     def write(self, block: EstimateBlock) -> None:
         """Write the frames of the next estimates, and HEARTBEAT once a second."""
-        if self._identity:
-            self._emitter.system = self._identity.system
+        self._emitter.system = self._identity.system
+        self._emitter.profile = self._identity.profile
         for i, received_us in enumerate(block.received_us.tolist()):
             frames = self._emitter.emit(block.at(i))
             second = received_us // 1_000_000
@@ -106,7 +106,7 @@ class Replay:
         self._path = path
         self._selection = selection
         self._pipeline = Pipeline(config, config.own, load_calibration(config))
-        self.identity = Identity(*config.own, adopts=config.mavlink.system_id is None)
+        self.identity = identity_of(config)
         parameters = Parameters(config, fixed=selection.fixed)
         self._component = Component(parameters, self._pipeline, self.identity, keep=self._keep)
         self._gps = Ingest(config.array, config.gps, config.own)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from risaf_link.config import Config, load_calibration
+from risaf_link.config import Config, identity_of, load_calibration
 from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.kernel import BUILT
@@ -25,7 +25,6 @@ from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.component import HEARD, Component
 from risaf_link.mavlink.frame import FrameParser, FrameTable
 from risaf_link.mavlink.held import Held
-from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.requests import Requests
@@ -119,7 +118,7 @@ class Service:
         self._component = Component(
             parameters,
             self.pipeline,
-            Identity(*config.own, adopts=config.mavlink.system_id is None),
+            identity_of(config),
             links={
                 link.name: Terms(link.emit, _pace(made), self._keys.links.get(link.name))
                 for link, made in zip(config.links, self.links, strict=True)

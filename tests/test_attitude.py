@@ -249,10 +249,13 @@ def test_reported_deviations_are_those_of_the_euler_angles(angles):
     estimator = filter_at(*angles)
     run(estimator, 0.2)
     jacobian = derivative(euler_from_quaternion, estimator._q)
-    variances = np.diag(jacobian @ estimator._covariance[ATTITUDE, ATTITUDE] @ jacobian.T)
+    covariance = jacobian @ estimator._covariance[ATTITUDE, ATTITUDE] @ jacobian.T
+    std = np.sqrt(np.diag(covariance))
     state = estimator.state(0)
     found = [state.roll_std, state.pitch_std, state.yaw_std]
-    assert found == pytest.approx(np.minimum(np.sqrt(variances), math.pi), rel=1e-6)
+    assert found == pytest.approx(np.minimum(std, math.pi), rel=1e-6)
+    correlation = state.angle_covariance / np.outer(found, found)
+    assert correlation == pytest.approx(covariance / np.outer(std, std), abs=1e-6)
 
 
 @pytest.mark.parametrize(("before", "heading"), [(3.1, -3.1), (-3.1, 3.1), (3.1, math.pi)])

@@ -23,6 +23,7 @@ from filters import (
     settled_filter,
     tilt_error,
 )
+from hamilton import derivative, product, rotation
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace as set_parameters
@@ -117,6 +118,21 @@ def test_without_accelerometer_the_tilt_is_as_unknown_as_the_bias_makes_it():
     assert state.pitch_std == pytest.approx(expected, rel=0.02)
     assert state.yaw_std == math.pi
     assert not state.aligned
+    assert (state.angle_covariance[2, :2] == 0.0).all()
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 1), (0.3, 0.2, -2), (-1.2, 0.8, 3), (2.5, -1.3, 0.5)])
+def test_the_covariance_of_the_angles_is_that_of_the_attitude(angles):
+    estimator = aligned_filter()
+    run(estimator, 3.0, (0.4, -0.3, 0.5))  # so that the errors have something in common
+    q_nb = quaternion_from_euler(*angles)
+    estimator.set_attitude(q_nb)
+    by_error = derivative(lambda e: euler_from_quaternion(product(rotation(e), q_nb)), np.zeros(3))
+    expected = by_error @ estimator.covariance[ATTITUDE, ATTITUDE] @ by_error.T
+    std = np.sqrt(expected.diagonal())
+    found = estimator.state(0).angle_covariance
+    assert found / np.outer(std, std) == pytest.approx(expected / np.outer(std, std), abs=1e-6)
+    assert np.abs(found[0, 1]) > 1e-3 * std[0] * std[1]
 
 
 def test_an_error_of_scale_grows_with_the_angle_turned_and_goes_with_turning_back():

@@ -70,6 +70,9 @@ def test_the_kernel_s_filter_is_that_of_the_python_form(seed):
             assert native.variance == pytest.approx(python.variance, rel=1e-9)
         python, native = (estimator.state(0) for estimator in filters)
         assert np.abs(python.q_nb - native.q_nb).max() < 1e-11
+        std = np.sqrt(python.angle_covariance.diagonal())
+        apart = (python.angle_covariance - native.angle_covariance) / np.outer(std, std)
+        assert np.abs(apart).max() < 1e-9
     deviation = np.sqrt(filters[0].covariance.diagonal())
     difference = (filters[0].covariance - filters[1].covariance) / np.outer(deviation, deviation)
     assert np.abs(difference).max() < 1e-11

@@ -228,8 +228,12 @@ def test_the_attitude_comes_with_its_variances(drive):
     assert told.q == pytest.approx(attitude.q_nb, abs=1e-7)
     rates = (told.rollspeed, told.pitchspeed, told.yawspeed)
     assert rates == pytest.approx(attitude.rate_b, abs=1e-7)
+    told_of = np.reshape(told.covariance, (3, 3))
     std = (attitude.roll_std, attitude.pitch_std, attitude.yaw_std)
-    assert told.covariance == pytest.approx(np.diag(np.square(std)).ravel(), rel=1e-6)
+    assert np.sqrt(told_of.diagonal()) == pytest.approx(std, rel=1e-6)
+    common = (told_of[0, 1], told_of[0, 2], told_of[1, 2])
+    assert common == pytest.approx(attitude.common, rel=1e-6, abs=1e-12)
+    assert (told_of == told_of.T).all()
 
 
 def test_what_is_asked_for_beside_it_says_the_same(drive):

@@ -6,7 +6,7 @@ here are theirs.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -32,6 +32,7 @@ LONG_STEP = 1.0  # s that a rate is believed to have lasted
 UNSEEN_TURN = 0.5  # rad/s, standard deviation of a vehicle's turning that no rate tells of
 UNKNOWN_YAW = 0.5  # rad, standard deviation of a yaw that a heading sets instead of correcting it
 
+PAIRS = (np.array([0, 0, 1]), np.array([1, 2, 2]))  # of roll, pitch and yaw
 _I4, _I7 = np.eye(4), np.eye(7)
 
 
@@ -86,7 +87,16 @@ class AttitudeState:
     pitch_std: float  # rad
     yaw_std: float  # rad; pi while yaw is not known
     aligned: bool  # yaw has been set by a heading
-    resets: int  # how often yaw was set
+    resets: int  # how often yaw was set, also by filters before this one
+    common: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) rad^2, covariances of roll with pitch, of roll with yaw, of pitch with yaw"""
+
+    @property
+    def angle_covariance(self) -> Floats:
+        """Covariance of roll, pitch and yaw, (3, 3), rad^2."""
+        covariance = np.diag(np.square((self.roll_std, self.pitch_std, self.yaw_std)))
+        covariance[PAIRS] = covariance[PAIRS[::-1]] = self.common
+        return covariance
 
     @property
     def euler(self) -> tuple[float, float, float]:
@@ -228,7 +238,9 @@ class PaperFilter:
         and independent of all others.
         """
         error = wrap(heading - self._yaw_before(age))
-        innovation = Innovation(error, self._euler_std()[2] ** 2 + variance, gate, reset=True)
+        jacobian = _euler_jacobian(self._q)
+        before, _ = angle_spread(jacobian, self._covariance[ATTITUDE, ATTITUDE])
+        innovation = Innovation(error, before[2] ** 2 + variance, gate, reset=True)
         turn = left_matrix(np.array([math.cos(error / 2), 0.0, 0.0, math.sin(error / 2)]))
         by_yaw = _by_angles(self._q)[:, 2]
         keep = _I7.copy()
@@ -244,14 +256,20 @@ class PaperFilter:
 
     def state(self, time_us: int) -> AttitudeState:
         """Read the estimate as of the last predict."""
+        jacobian = _euler_jacobian(self._q)
+        std, common = angle_spread(jacobian, self._covariance[ATTITUDE, ATTITUDE])
+        roll, pitch, yaw = std
         return AttitudeState(
             time_us,
             self._q,
             self._rate,
             self._bias,
-            *self._euler_std(),
+            roll,
+            pitch,
+            yaw,
             self._resets > 0,
             self._resets,
+            common,
         )
 
     def _integrate(self, rate: Floats, variance: Floats, dt: float) -> None:
@@ -297,15 +315,34 @@ class PaperFilter:
         by_yaw = _by_angles(self._q)[:, 2]
         return float(16 * by_yaw @ self._covariance[ATTITUDE, ATTITUDE] @ by_yaw)
 
-    def _euler_std(self) -> tuple[float, float, float]:
-        jacobian = _euler_jacobian(self._q)
-        variance = ((jacobian @ self._covariance[ATTITUDE, ATTITUDE]) * jacobian).sum(axis=1)
-        roll, pitch, yaw = (min(math.sqrt(max(v, 0.0)), math.pi) for v in variance.tolist())
-        return roll, pitch, yaw
-
     def _yaw_before(self, age: float) -> float:
         yaw = self._yaws.before(age)
         return yaw_of(self._q) if yaw is None else yaw
+
+
+def angle_spread(jacobian: Floats, covariance: Floats) -> tuple[list[float], Floats]:
+    """How far roll, pitch and yaw may be off.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (3, n)
+        Their derivatives by the error of an attitude.
+    covariance : ndarray, shape (n, n)
+        Of that error.
+
+    Returns
+    -------
+    std : list of float
+        Their three standard deviations, rad; half a turn at most, from where on nothing is known.
+    common : ndarray, shape (3,)
+        Covariances of roll with pitch, of roll with yaw, of pitch with yaw, rad^2.
+    """
+    carried = jacobian @ covariance
+    whole = np.sqrt(np.maximum((carried * jacobian).sum(axis=1), 0.0))
+    kept = math.pi / np.maximum(whole, math.pi)  # of each, so that they stay a covariance
+    one, other = PAIRS
+    common: Floats = (carried @ jacobian.T)[PAIRS] * kept[one] * kept[other]
+    return np.minimum(whole, math.pi).tolist(), common
 
 
 def _normalised(q: Floats) -> tuple[Floats, Floats]:

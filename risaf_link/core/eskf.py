@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from risaf_link.core import quaternion
-from risaf_link.core.attitude import AttitudeParameters, AttitudeState
+from risaf_link.core.attitude import AttitudeParameters, AttitudeState, angle_spread
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
 from risaf_link.core.error_state import (
     ACCELEROMETER,
@@ -368,8 +368,9 @@ class Eskf:
         q_nb = self._attitude
         matrix_nb = quaternion.matrix(q_nb)
         rows = np.array([*tilt_rows(matrix_nb), yaw_row(matrix_nb, self._rate, 0.0)[ATTITUDE]])
-        variance = ((rows @ self._covariance[ATTITUDE, ATTITUDE]) * rows).sum(axis=1)
-        roll, pitch, yaw = np.minimum(np.sqrt(variance), math.pi).tolist()
+        (roll, pitch, yaw), common = angle_spread(rows, self._covariance[ATTITUDE, ATTITUDE])
+        if not self._aligned:
+            yaw, common[1:] = math.pi, 0.0
         return AttitudeState(
             time_us,
             np.array(q_nb),
@@ -377,9 +378,10 @@ class Eskf:
             self._bias.copy(),
             roll,
             pitch,
-            yaw if self._aligned else math.pi,
+            yaw,
             self._aligned,
             self._resets,
+            common,
         )
 
     def _rotation(self, dt: float) -> Vector:

@@ -19,7 +19,7 @@ from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion
 from risaf_link.core.rotation import Floats
-from risaf_link.core.track import Track
+from risaf_link.core.track import RESETS, Track
 
 FUSIONS: dict[str, Callable[[FusionParameters], Fusion]] = {
     "robust": kernel.Robust,
@@ -54,10 +54,15 @@ class Estimator:
         self._force_fusion = kernel.Robust(structs.replace(fusion, resolution=FORCE_RESOLUTION))
         self.elapsed = 0.0
         self._parameters = fusion, attitude, heading
-        self.restart()
+        self._resets = 0  # of yaw, by the filters before this one
+        self._begin()
 
     def restart(self) -> None:
         """Start the filter, and what aids and guards it, anew; the array stays known."""
+        self._resets += self._filter.state(0).resets
+        self._begin()
+
+    def _begin(self) -> None:
         _, attitude, heading = self._parameters
         self._filter: kernel.Eskf | PaperFilter
         if attitude.filter == "eskf":
@@ -127,6 +132,8 @@ class Estimator:
             track = Track.of([step(*parts, Epoch(0, *epoch, 0)) for epoch in epochs])
         else:
             track = Track(values)
+        if self._resets:
+            track.values[:, RESETS] += self._resets
         elapsed: Floats = dt.copy()
         elapsed[0] += self.elapsed
         if len(dt) > 1:

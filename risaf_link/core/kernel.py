@@ -215,8 +215,10 @@ class _Eskf:
 
     def state(self, time_us: int) -> AttitudeState:
         """Read the estimate as of the last predict."""
-        q_nb, rate_b, bias_b, (roll, pitch, yaw), aligned, resets = self.kernel.state()
-        return AttitudeState(time_us, q_nb, rate_b, bias_b, roll, pitch, yaw, aligned, resets)
+        q_nb, rate_b, bias_b, std, common, aligned, resets = self.kernel.state()
+        roll, pitch, yaw = std
+        known = aligned, resets, np.array(common)
+        return AttitudeState(time_us, q_nb, rate_b, bias_b, roll, pitch, yaw, *known)
 
 
 class _SpeedTracker(native.SpeedTracker if BUILT else object):  # type: ignore[misc]

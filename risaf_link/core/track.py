@@ -14,7 +14,8 @@ Q_NB, RATE, BIAS, STD = slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13)
 ALIGNED, RESETS = 13, 14
 FUSED, VARIANCE, NOISE, WALK = slice(15, 18), slice(18, 21), slice(21, 24), slice(24, 27)
 ACTIVE, VALID, AHEAD = slice(27, 30), 30, 31
-COLUMNS = 32
+COMMON = slice(32, 35)
+COLUMNS = 35
 YAW_STD = 12
 
 
@@ -23,7 +24,7 @@ class Track:
 
     Parameters
     ----------
-    values : ndarray, shape (k, 32)
+    values : ndarray, shape (k, 35)
         The columns that this module names; units are those of `FusedRate` and `AttitudeState`.
     """
 
@@ -40,6 +41,7 @@ class Track:
                     (state.roll_std, state.pitch_std, state.yaw_std, state.aligned, state.resets),
                     *(fused.rate_b, fused.variance, fused.noise, fused.bias_walk, fused.active),
                     (fused.valid, _ahead(state.q_nb, force_b)),
+                    state.common,
                 )
             )
             for fused, state, force_b in epochs
@@ -114,9 +116,8 @@ class Track:
         """The attitude at one epoch."""
         row = self.values[i]
         roll, pitch, yaw, aligned, resets = row[STD.start : RESETS + 1].tolist()
-        return AttitudeState(
-            time_us, row[Q_NB], row[RATE], row[BIAS], roll, pitch, yaw, aligned > 0.0, int(resets)
-        )
+        known = aligned > 0.0, int(resets), row[COMMON]
+        return AttitudeState(time_us, row[Q_NB], row[RATE], row[BIAS], roll, pitch, yaw, *known)
 
 
 def _ahead(q_nb: Floats, force_b: Floats) -> float:

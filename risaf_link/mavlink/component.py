@@ -115,6 +115,7 @@ class Component:
         self._links = links or {}
         self._requests = requests or Requests({})
         self._peers = Peers(*identity.own, parameters.tuned.emit, self._links)
+        self._peers.feed(identity.profile)
         self._pace = {name: terms.pace for name, terms in self._links.items()}
         self._keep = keep
         self._stored = dict(parameters.kept)
@@ -160,6 +161,7 @@ class Component:
             return
         if self._identity.hear(frame, received_us):
             self._adopt()
+        self._peers.feed(self._identity.profile)
         if frame.message_id == SETUP_SIGNING:
             self._set_up_signing(frame, peer)
         order = order_in(frame, peer)
@@ -322,9 +324,10 @@ class Component:
         if wanted is None:
             return Result.DENIED
         if wanted in EMITTED:
-            if self._estimate is None:
+            emitter, name = self._peers.emitter(order.peer), EMITTED[wanted]
+            if self._estimate is None or not emitter.can_tell(name, self._estimate):
                 return Result.TEMPORARILY_REJECTED
-            fields = self._peers.emitter(order.peer).fields(EMITTED[wanted], self._estimate)
+            fields = emitter.fields(name, self._estimate)
         elif wanted == IDS["COMPONENT_INFORMATION_BASIC"]:
             fields = self._information()
         elif wanted == IDS["HEARTBEAT"]:

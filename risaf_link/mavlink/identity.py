@@ -5,6 +5,7 @@ An autopilot is known by what its HEARTBEAT says, never by its component id.
 
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.odometry import AUTOPILOTS, PROFILES, ProfileName
 
 WINDOW_US = 3_000_000  # after the first autopilot, in which another one may be heard
 GROUND_STATION, NO_AUTOPILOT = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
@@ -32,11 +33,22 @@ class Identity:
         Whom we are.
     adopts : bool
         Whether the system id of the one autopilot that is heard is taken.
+    odometry : str
+        Which autopilot ODOMETRY is for; auto: our vehicle's, as its HEARTBEAT tells.
+
+    Attributes
+    ----------
+    profile : Profile or None
+        How that one takes it; None: not known.
     """
 
-    def __init__(self, system: int, component: int, adopts: bool) -> None:
+    def __init__(
+        self, system: int, component: int, adopts: bool, odometry: ProfileName = "auto"
+    ) -> None:
         self.system = system
         self.component = component
+        self.profile = PROFILES.get(odometry)
+        self._follows = self.profile is None  # the autopilot's HEARTBEAT
         self._armed_us: int | None = None  # when the autopilot last said that it is
         self._undecided = adopts
         self._heard: set[int] = set()  # systems with an autopilot
@@ -57,9 +69,13 @@ class Identity:
         is_own = (frame.system, frame.component) == self.own
         if base_mode is None or is_own or not frame.system:
             return False
+        renamed = self._undecided and self._decide(frame.system, received_us)
         if frame.system == self.system:
             self._armed_us = received_us if base_mode & ARMED else None
-        return self._undecided and self._decide(frame.system, received_us)
+            _, autopilot, _ = _HEARTBEAT(frame.payload)
+            if self._follows:
+                self.profile = AUTOPILOTS.get(autopilot, self.profile)
+        return renamed
 
     def _decide(self, system: int, received_us: int) -> bool:
         if not self._heard:

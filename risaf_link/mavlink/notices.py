@@ -86,8 +86,10 @@ class Notices:
         notices: list[Notice | None] = []
         if self._changed("clock", self._clock_resets, 0, now_us):
             notices.append(Notice(Severity.NOTICE, "the array's clock was reset"))
-        if self._changed("yaw", attitude.resets, 0, now_us) and attitude.aligned:
-            word = "aligned" if attitude.resets == 1 else "set anew"
+        was_aligned, _ = self._told.get("yaw", (0, 0))
+        resets = attitude.resets if attitude.aligned else 0
+        if self._changed("yaw", resets, 0, now_us) and resets:
+            word = "set anew" if was_aligned else "aligned"
             degrees = math.degrees(attitude.euler[2]) % 360.0
             notices.append(Notice(Severity.INFO, f"heading {word}: {degrees:.0f} deg"))
         out = attitude.aligned and estimate.heading.state is HeadingState.DEAD_RECKONING

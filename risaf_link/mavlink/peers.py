@@ -7,6 +7,7 @@ from typing import get_args
 
 from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.dialect import IDS
+from risaf_link.mavlink.odometry import Profile
 from risaf_link.mavlink.pulse import HEARTBEAT_US
 from risaf_link.mavlink.signing import LinkSigning
 from risaf_link.mavlink.telemetry import Emitter, Message, Rates
@@ -50,6 +51,7 @@ class Peers:
         self._own = system, component
         self._rates = rates
         self._links = links
+        self._profile: Profile | None = None
         self._emitters: dict[Peer, Emitter] = {}
 
     def emitter(self, peer: Peer) -> Emitter:
@@ -58,7 +60,7 @@ class Peers:
         if emitter is None:
             terms = self._links.get(peer[0], ANY)
             rates = self._rates if terms.rates is None else terms.rates
-            emitter = Emitter(rates, *self._own, terms.signing)
+            emitter = Emitter(rates, *self._own, terms.signing, self._profile)
             self._emitters[peer] = emitter
             if len(self._emitters) > MOST_PEERS:
                 del self._emitters[next(iter(self._emitters))]
@@ -84,6 +86,13 @@ class Peers:
         self._own = system, self._own[1]
         for emitter in self._emitters.values():
             emitter.system = system
+
+    def feed(self, profile: Profile | None) -> None:
+        """Take note of how the vehicle's autopilot takes ODOMETRY; None: it is not known."""
+        if profile is not self._profile:
+            self._profile = profile
+            for emitter in self._emitters.values():
+                emitter.profile = profile
 
     def ask(self, peer: Peer, message_id: int, interval_us: float) -> bool:
         """Let a peer have a message so often, -1 not at all, 0 by default; whether that can be."""

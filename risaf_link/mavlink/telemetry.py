@@ -15,6 +15,7 @@ from risaf_link.core.health import ArrayHealth, SensorState
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import encode
 from risaf_link.mavlink.identity import NO_AUTOPILOT
+from risaf_link.mavlink.odometry import Profile, odometry
 from risaf_link.mavlink.signing import LinkSigning
 
 Message = Literal[
@@ -26,6 +27,7 @@ Message = Literal[
     "ATTITUDE_QUATERNION_COV",
     "ESTIMATOR_STATUS",
     "NAMED_VALUE_FLOAT",
+    "ODOMETRY",
 ]
 
 Rates = dict[Message, Annotated[float, Meta(gt=0, le=10_000)]]
@@ -40,7 +42,7 @@ DEFAULT_RATES: Rates = {
     "ATTITUDE_QUATERNION_COV": 5.0,
 }
 """What a link emits unless told otherwise, Hz. ESTIMATOR_STATUS is not among it: ground stations
-take it for the autopilot's."""
+take it for the autopilot's. ODOMETRY is not: an autopilot may steer by it."""
 
 ONBOARD_CONTROLLER = 18  # MAV_TYPE
 MAVLINK_VERSION = 3
@@ -71,17 +73,25 @@ class Emitter:
         Whom the frames come from.
     signing : LinkSigning or None
         Of the link; None: frames are not signed.
+    profile : Profile or None
+        Of the autopilot that ODOMETRY is for; None: it is not sent.
 
     Attributes
     ----------
-    system : int
-        As given; it may be another later.
+    system, profile
+        As given; they may be others later.
     """
 
     def __init__(
-        self, rates: Rates, system: int, component: int, signing: LinkSigning | None = None
+        self,
+        rates: Rates,
+        system: int,
+        component: int,
+        signing: LinkSigning | None = None,
+        profile: Profile | None = None,
     ) -> None:
         self.system = system
+        self.profile = profile
         self._signing = signing
         self._rates = rates
         self._asked: dict[Message, float] = {}  # Hz, 0: none
@@ -115,8 +125,13 @@ class Emitter:
             period = math.floor(estimate.time_us * rate / 1e6)
             if period != self._periods.get(name):
                 self._periods[name] = period
-                frames.append(self.tell(name, estimate))
+                if self.can_tell(name, estimate):
+                    frames.append(self.tell(name, estimate))
         return frames
+
+    def can_tell(self, name: Message, estimate: Estimate) -> bool:
+        """Whether there is anything to tell: to an autopilot nothing before the heading is set."""
+        return name != "ODOMETRY" or (self.profile is not None and estimate.attitude.aligned)
 
     def tell(self, name: Message, estimate: Estimate) -> bytes:
         """A frame that tells of an estimate, whether it is due or not."""
@@ -128,6 +143,8 @@ class Emitter:
             turn = self._next_part.get(name, 0)
             self._next_part[name] = (turn + 1) % len(_NAMED)
             return _named_value_float(estimate, turn)
+        if name == "ODOMETRY" and self.profile:
+            return odometry(estimate, self.profile)
         if name not in _ROUND_ROBIN:
             return _FIELDS[name](estimate)
         fields, most = _ROUND_ROBIN[name]
@@ -178,14 +195,12 @@ def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
 
 
 def _attitude_quaternion_cov(estimate: Estimate) -> dict[str, Any]:
-    """The variances of roll, pitch and yaw; what they have in common is not told."""
     attitude = estimate.attitude
-    variances = np.square((attitude.roll_std, attitude.pitch_std, attitude.yaw_std))
     return {
         "time_usec": estimate.boot_us,
         "q": attitude.q_nb,
         **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), attitude.rate_b, strict=True)),
-        "covariance": np.diag(variances).ravel(),
+        "covariance": attitude.angle_covariance.ravel(),
     }
 
 

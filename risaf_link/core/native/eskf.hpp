@@ -148,8 +148,13 @@ class Eskf {
     return sum;
   }
 
-  // Standard deviations of roll, pitch and yaw.
-  Vector angle_std() const {
+  // Standard deviations of roll, pitch and yaw, half a turn at most; covariances of roll with
+  // pitch, of roll with yaw, of pitch with yaw.
+  struct AngleSpread {
+    Vector std, common;
+  };
+
+  AngleSpread angle_spread() const {
     const Matrix matrix_nb = matrix(attitude());
     const double north = matrix_nb[0][0], east = matrix_nb[1][0];
     const double level = std::max(north * north + east * east, 1e-12), cosine = std::sqrt(level);
@@ -157,18 +162,22 @@ class Eskf {
     const Vector rows[3] = {{north / level, east / level, 0.0},
                             {-east / cosine, north / cosine, 0.0},
                             {yaw_row[0], yaw_row[1], yaw_row[2]}};
-    Vector std;
+    Vector carried[3], kept, std;
     for (std::size_t i = 0; i < 3; ++i) {
-      double variance = 0.0;
-      for (std::size_t j = 0; j < 3; ++j) {
-        for (std::size_t k = 0; k < 3; ++k) {
-          variance += rows[i][j] * covariance_[j][k] * rows[i][k];
-        }
+      for (std::size_t k = 0; k < 3; ++k) {
+        carried[i][k] = rows[i][0] * covariance_[0][k] + rows[i][1] * covariance_[1][k] +
+                        rows[i][2] * covariance_[2][k];
       }
-      std[i] = std::min(std::sqrt(variance), PI);
+      const double whole = std::sqrt(std::max(dot(carried[i], rows[i]), 0.0));
+      std[i] = std::min(whole, PI);
+      kept[i] = PI / std::max(whole, PI);  // so that they stay a covariance
     }
+    const double by_yaw_known = aligned_ ? kept[2] : 0.0;
     std[2] = aligned_ ? std[2] : PI;
-    return std;
+    return {std,
+            {dot(carried[0], rows[1]) * kept[0] * kept[1],
+             dot(carried[0], rows[2]) * kept[0] * by_yaw_known,
+             dot(carried[1], rows[2]) * kept[1] * by_yaw_known}};
   }
 
   // What others set.

@@ -15,6 +15,7 @@ struct Known {
   double q_nb[4], rate_b[3], bias_b[3], angle_std[3], aligned, resets;
   double fused[3], variance[3], noise[3], bias_walk[3], active[3], valid;
   double ahead;
+  double common[3];
 };
 
 // Carry the attitude on over `epochs`, with readings of `n` gyros and `m` accelerometers each.
@@ -33,7 +34,7 @@ void advance(Fusion& gyros, Robust& accelerometers, Eskf& filter, Aiding& aiding
     }
     aiding.take(filter, {fused[0].rate, fused[1].rate, fused[2].rate}, force_b, dt[i]);
     const Quaternion q_nb = filter.attitude();
-    const Vector std = filter.angle_std();
+    const auto [std, common] = filter.angle_spread();
     known->q_nb[0] = q_nb.w;
     known->q_nb[1] = q_nb.x;
     known->q_nb[2] = q_nb.y;
@@ -42,6 +43,7 @@ void advance(Fusion& gyros, Robust& accelerometers, Eskf& filter, Aiding& aiding
       known->rate_b[k] = filter.rate()[k];
       known->bias_b[k] = filter.bias()[k];
       known->angle_std[k] = std[k];
+      known->common[k] = common[k];
       known->fused[k] = fused[k].rate;
       known->variance[k] = fused[k].variance;
       known->noise[k] = fused[k].noise;

@@ -96,13 +96,14 @@ Array<double> covariance(const Eskf& filter) {
   return owned(values, {risaf::STATES, risaf::STATES});
 }
 
-// q_nb, rate, bias, standard deviations of the angles, aligned, resets.
+// q_nb, rate, bias, standard deviations of the angles, their covariances, aligned, resets.
 nb::tuple state(const Eskf& filter) {
   const auto [w, x, y, z] = filter.attitude();
   const Vector &rate = filter.rate(), &bias = filter.bias();
+  const auto [std, common] = filter.angle_spread();
   return nb::make_tuple(owned(new double[4]{w, x, y, z}, {4}),
                         owned(new double[3]{rate[0], rate[1], rate[2]}, {3}),
-                        owned(new double[3]{bias[0], bias[1], bias[2]}, {3}), filter.angle_std(),
+                        owned(new double[3]{bias[0], bias[1], bias[2]}, {3}), std, common,
                         filter.aligned(), filter.resets());
 }
 
