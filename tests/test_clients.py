@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -11,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from random import Random
 
+import numpy as np
 import pytest
 import yaml
 from streams import parsed
@@ -26,6 +29,11 @@ SYSTEM = 3
 RISAF = [sys.executable, "-c", "from risaf_link.cli import main; main()"]
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 KEY = bytes(range(32))
+either_link = pytest.mark.parametrize("is_bad", [False, True], ids=["good link", "bad link"])
+needs_node = pytest.mark.skipif(
+    "CI" not in os.environ and not (shutil.which("node") and (CLIENTS / "node_modules").is_dir()),
+    reason="no node-mavlink: apt-get install nodejs npm; npm ci --prefix tests/clients",
+)
 UNSIGNED_SET = bytes(
     frame(
         "PARAM_SET",
@@ -99,7 +107,7 @@ class BadLink(asyncio.DatagramProtocol):
         self._to, self._random = to, Random(seed)  # noqa: S311
         self._client: tuple[str, int] | None = None
         self._kept: dict[tuple[str, int], bytes] = {}
-        self.lost = 0
+        self.lost = self.doubled = self.overtaken = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = transport
@@ -116,15 +124,17 @@ class BadLink(asyncio.DatagramProtocol):
             self._kept[to] = data
         else:
             times = 2 if chance < 0.3 else 1
+            self.doubled += times - 1
             for _ in range(times):
                 self.transport.sendto(data, to)
             if to in self._kept:
+                self.overtaken += 1
                 self.transport.sendto(self._kept.pop(to), to)
 
 
 async def client(name: str, *arguments: object) -> dict:
     process = await asyncio.create_subprocess_exec(
-        sys.executable,
+        "node" if name.endswith(".js") else sys.executable,
         str(CLIENTS / name),
         *map(str, arguments),
         stdout=subprocess.PIPE,
@@ -169,7 +179,17 @@ async def bad_link(service: Running) -> AsyncIterator[BadLink]:
     )
     yield link
     transport.close()
-    assert link.lost > 5
+    assert min(link.lost, link.doubled, link.overtaken) > 5
+
+
+@asynccontextmanager
+async def link_to(service: Running, is_bad: bool) -> AsyncIterator[int]:
+    """Port behind which the service is."""
+    if not is_bad:
+        yield service.port
+        return
+    async with bad_link(service) as link:
+        yield link.port
 
 
 async def test_a_ground_station_on_a_bad_link(service):
@@ -219,20 +239,19 @@ async def test_a_ground_station_that_signs_on_a_bad_link(signed_service):
     assert found["signed"]
 
 
-async def test_an_autopilot_is_asked_for_what_the_array_does_not_bring_and_for_its_time(service):
-    found = await client("autopilot.py", f"udpout:127.0.0.1:{service.port}", 2)
+@either_link
+async def test_an_autopilot_is_asked_for_what_is_missing_and_for_its_time(service, is_bad):
+    async with link_to(service, is_bad) as port:
+        found = await client("autopilot.py", f"udpout:127.0.0.1:{port}", 2)
     assert found["asked"] == {str(IDS["GPS_RAW_INT"]): 200_000, str(IDS["SYSTEM_TIME"]): 1_000_000}
     assert abs(found["offsets_s"][-1]) < 0.05  # our stamps are on the autopilot's clock by then
 
 
 @pytest.mark.skipif(not find_spec("mavsdk"), reason="mavsdk is not installed")
-@pytest.mark.parametrize("is_bad", [False, True], ids=["good link", "bad link"])
+@either_link
 async def test_mavsdk_takes_us_for_a_component_and_tunes_it(service, is_bad):
-    if is_bad:
-        async with bad_link(service) as link:
-            found = await client("mavsdk_client.py", link.port, SYSTEM)
-    else:
-        found = await client("mavsdk_client.py", service.port, SYSTEM)
+    async with link_to(service, is_bad) as port:
+        found = await client("mavsdk_client.py", port, SYSTEM)
     assert found["components"] == [191]
     assert not found["has_autopilot"]
     assert (found["read"], found["set"], found["read_again"]) == (4.0, 1, 5.5)  # 1: SUCCESS
@@ -242,3 +261,36 @@ async def test_mavsdk_takes_us_for_a_component_and_tunes_it(service, is_bad):
     assert results == [ACCEPTED, DENIED, UNSUPPORTED]
     attitude = found["attitude"]
     assert sum(attitude[f"q{i}"] ** 2 for i in range(1, 5)) == pytest.approx(1.0, abs=1e-6)
+
+
+def assert_decoded(found: dict) -> None:
+    """What another codec must have made of our frames."""
+    counts = found["counts"]
+    assert counts["frames"] > 50
+    assert (counts["checksums"], counts["signatures"]) == (0, 0)
+    assert counts["spoiled"] == 1  # it does look
+    one, other = found["attitude"], found["attitude_cov"]
+    assert np.linalg.norm([one, other], axis=1) == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert abs(np.dot(one, other)) > 0.9  # within a turn of some seconds
+    covariance = np.reshape(found["covariance"], (3, 3))
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+    assert covariance.tolist() == covariance.T.tolist()
+
+
+@needs_node
+@either_link
+async def test_another_codec_understands_us_and_is_understood(service, is_bad):
+    async with link_to(service, is_bad) as port:
+        found = await client("node_client.js", port, 20)
+    assert_served(found, 20)
+    assert_decoded(found)
+    assert is_bad or set(found["periods_ms"]) == {50}
+
+
+@needs_node
+@either_link
+async def test_another_codec_signs_and_finds_our_signatures_right(signed_service, is_bad):
+    async with link_to(signed_service, is_bad) as port:
+        found = await client("node_client.js", port, 20, KEY.hex())
+    assert_served(found, 20)
+    assert_decoded(found)
