@@ -1,10 +1,12 @@
 """The vehicle's boot clock, for an array that counts its own time.
 
-Two clocks are compared through a third, the arrival time: of all that came within some seconds, the
-frame that was least delayed tells best how far a sender's clock is ahead of it. Better still are
-the autopilot's answers to TIMESYNC, which say how long they took. When the array's clock seems to
-jump, the third may have been set or the link may have stalled: the offset that was found before
-holds until the vehicle tells its time again.
+Two clocks are compared through a third, the arrival time: `Lead` tells how far each is ahead of it.
+The array's is told by its epochs, the vehicle's by SYSTEM_TIME and by answers to TIMESYNC.
+
+When epochs come too early or too late, by their own time, one of three things has happened. The
+array's clock was started anew, or set; the link has stalled; or the arrival times were set, and
+then the vehicle's come too early or too late by as much. Until that is known, the offset between
+both clocks holds as it was.
 """
 
 import numpy as np
@@ -13,53 +15,15 @@ from numpy.typing import NDArray
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.identity import autopilot_mode
-from risaf_link.mavlink.timesync import Sample, Synchronised, sample_in
+from risaf_link.mavlink.lead import GROSS_US, WINDOW_US, Lead
+from risaf_link.mavlink.timesync import sample_in
 
-WINDOW_US = 10_000_000
 SAME_CLOCK_US = 500_000  # clocks that differ by less are one
+DECIDED_US = 2_000_000  # for which epochs are out of the way before it is said why
 
 _SYSTEM_TIME = reader("SYSTEM_TIME", "time_unix_usec", "time_boot_ms")
 
 Times = NDArray[np.int64]
-
-
-class _Lead:
-    """How far a sender's clock is ahead of the arrival time: the most of the last seconds."""
-
-    def __init__(self) -> None:
-        self.lead_us: int | None = None
-        self._current_us = 0
-        self._since_us = 0
-
-    def note(self, time_us: int, received_us: int) -> bool:
-        """Take a time and its arrival; whether one of the clocks has jumped."""
-        lead_us = time_us - received_us
-        has_jumped = self.lead_us is not None and abs(lead_us - self.lead_us) > SAME_CLOCK_US
-        if self.lead_us is None or has_jumped:
-            self.lead_us = self._current_us = lead_us
-            self._since_us = received_us
-        elif 0 <= received_us - self._since_us < WINDOW_US:
-            self._current_us = max(self._current_us, lead_us)
-            self.lead_us = max(self.lead_us, lead_us)
-        else:
-            self.lead_us = max(self._current_us, lead_us)
-            self._current_us, self._since_us = lead_us, received_us
-        return has_jumped
-
-    def note_steady(self, time_us: Times, received_us: Times) -> Times | None:
-        """Take k times and arrivals, (k,) each; the lead at each. None: one by one, `note` it."""
-        if self.lead_us is None:
-            return None
-        leads_us = time_us - received_us
-        most_us = int(leads_us.max())
-        lead_us = max(self.lead_us, most_us)
-        since_us = received_us - self._since_us
-        steady = lead_us - min(self.lead_us, int(leads_us.min())) <= SAME_CLOCK_US
-        if not steady or since_us.min() < 0 or since_us.max() >= WINDOW_US:
-            return None
-        self._current_us = max(self._current_us, most_us)
-        before_us, self.lead_us = self.lead_us, lead_us
-        return np.maximum.accumulate(np.maximum(leads_us, before_us))
 
 
 class VehicleClock:
@@ -84,8 +48,12 @@ class VehicleClock:
         self._component = component
         self.delay_us = 0
         self._autopilot: tuple[int, int] | None = None
-        self._vehicle, self._array = _Lead(), _Lead()
-        self._synchronised = Synchronised()
+        self._vehicle, self._array = Lead(), Lead()
+        self._other: Lead | None = None  # the array's, of epochs that are out of the way
+        self._other_since_us = 0
+        self._told_us = 0  # time of the vehicle, when last told
+        self._odd_since_us = 0  # arrival, since when it is out of the way
+        self._last: tuple[int, int] | None = None  # epoch: its time, and its arrival
         self._offset_us = 0
         self._last_us: int | None = None  # stamp
 
@@ -97,55 +65,63 @@ class VehicleClock:
                 self._autopilot = sender
         elif frame.message_id == IDS["SYSTEM_TIME"] and sender == self._autopilot:
             _, boot_ms = _SYSTEM_TIME(frame.payload)
-            self._vehicle.note(boot_ms * 1000, received_us)
-            lead_us = boot_ms * 1000 - received_us
-            if self._synchronised.is_contradicted(lead_us, received_us, SAME_CLOCK_US):
-                self._synchronised = Synchronised()
+            if self._believes(boot_ms * 1000, received_us):
+                self._vehicle.note(boot_ms * 1000, received_us)
         elif frame.message_id == IDS["TIMESYNC"] and sender == self._autopilot:
             sample = sample_in(frame, self._component, received_us)
-            if sample:
-                self._synchronise(sample)
+            if sample and self._believes(sample.time_us, received_us):
+                self._vehicle.note_answer(sample.time_us, sample.sent_us, received_us)
 
     def now_us(self, received_us: int) -> int:
         """What the clock of our stamps shows at a time since 1970; that time, if none is known."""
-        if self._array.lead_us is None:
-            return received_us + (self._lead_of_vehicle(received_us) or 0)
+        if not self._array.is_known:
+            return received_us + (self._vehicle.at(received_us) if self._vehicle.is_known else 0)
         offset_us = self._offset_us if abs(self._offset_us) >= SAME_CLOCK_US else 0
-        return max(received_us + self._array.lead_us + offset_us, 0)
+        return max(received_us + (self._other or self._array).at(received_us) + offset_us, 0)
 
     def boot_us(self, time_us: int, received_us: int) -> int:
         """When the samples of an epoch were taken, which has just been received."""
-        if self._array.note(time_us, received_us):
-            self._vehicle, self._synchronised = _Lead(), Synchronised()
-        lead_us = self._lead_of_vehicle(received_us)
-        if lead_us is not None and self._array.lead_us is not None:
-            self._offset_us = lead_us - self._array.lead_us
+        off_us = self._array.off(time_us, received_us)
+        if off_us and not self._is_array_anew(time_us, received_us):
+            self._set_aside(time_us, received_us)
+        else:
+            if off_us:
+                self._array = Lead()
+            self._other = None
+            self._array.note(time_us, received_us)
+            if self._vehicle.is_known:
+                self._offset_us = self._vehicle.at(received_us) - self._array.at(received_us)
+        self._last = time_us, received_us
         is_same = abs(self._offset_us) < SAME_CLOCK_US
         stamp_us = time_us if is_same else time_us + self._offset_us
         return self._steady(max(stamp_us - self.delay_us, 0))
 
     def boot_times(self, time_us: Times, received_us: Times) -> Times:
         """Do what `boot_us` does, for k epochs that were received one after another."""
-        times_us = self._boot_times(time_us, received_us) if len(time_us) > 1 else None
-        if times_us is None:
-            pairs = zip(time_us.tolist(), received_us.tolist(), strict=True)
-            return np.array([self.boot_us(*pair) for pair in pairs])
-        return times_us
+        stamps = np.empty(len(time_us), np.int64)
+        done = 0
+        while done < len(stamps):
+            alike = self._boot_times(time_us[done:], received_us[done:])
+            if not len(alike):
+                alike = np.array([self.boot_us(int(time_us[done]), int(received_us[done]))])
+            stamps[done : done + len(alike)] = alike
+            done += len(alike)
+        return stamps
 
-    def _boot_times(self, time_us: Times, received_us: Times) -> Times | None:
-        """Times of epochs at which all goes as usual; None: it does not, and nothing was noted."""
-        ends_us = int(received_us[0]), int(received_us[-1])
-        if len({self._synchronised.is_known(end_us) for end_us in ends_us}) > 1:
-            return None
-        leads_us = self._array.note_steady(time_us, received_us)
-        if leads_us is None:
-            return None
-        offsets_us = np.full(len(time_us), self._offset_us)
-        if self._synchronised.is_known(ends_us[-1]):
-            offsets_us = self._synchronised.leads(received_us) - leads_us
-        elif self._vehicle.lead_us is not None:
-            offsets_us = self._vehicle.lead_us - leads_us
+    def _boot_times(self, time_us: Times, received_us: Times) -> Times:
+        """Stamps of the first epochs, as far as all goes as usual."""
+        if len(time_us) == 1 or self._other:
+            return time_us[:0]
+        leads_us = self._array.note_each(time_us, received_us)
+        count = len(leads_us)
+        if not count:
+            return time_us[:0]
+        time_us, received_us = time_us[:count], received_us[:count]
+        offsets_us = np.full(count, self._offset_us)
+        if self._vehicle.is_known:
+            offsets_us = self._vehicle.at_each(received_us) - leads_us
         self._offset_us = int(offsets_us[-1])
+        self._last = int(time_us[-1]), int(received_us[-1])
         same = np.abs(offsets_us) < SAME_CLOCK_US
         stamps_us = np.where(same, time_us, time_us + offsets_us)
         stamps: Times = np.maximum(stamps_us - self.delay_us, 0)
@@ -154,19 +130,51 @@ class VehicleClock:
         self._last_us = int(stamps[-1])
         return stamps
 
-    def _synchronise(self, sample: Sample) -> None:
-        """Take an answer of the autopilot's."""
-        is_new = self._synchronised.is_before(sample)
-        if self._synchronised.note(sample) and not is_new:
-            self._array = _Lead()  # the arrival times have jumped, not the vehicle
-        if is_new:
-            self._vehicle = _Lead()
+    def _is_array_anew(self, time_us: int, received_us: int) -> bool:
+        """Whether it is the array's clock that has jumped, beyond doubt."""
+        if self._last is None:
+            return False
+        step_us, passed_us = time_us - self._last[0], received_us - self._last[1]
+        return step_us < 0 or 0 <= passed_us < step_us - GROSS_US
 
-    def _lead_of_vehicle(self, received_us: int) -> int | None:
-        """How far the vehicle's clock is ahead of the arrival times; None: it is not known."""
-        if self._synchronised.is_known(received_us):
-            return self._synchronised.lead(received_us)
-        return self._vehicle.lead_us
+    def _set_aside(self, time_us: int, received_us: int) -> None:
+        """Take an epoch that is out of the way, for reasons that are not known yet."""
+        if self._other is None or self._other.off(time_us, received_us):
+            self._other, self._other_since_us = Lead(), received_us
+        self._other.note(time_us, received_us)
+        lasts_us = received_us - self._other_since_us
+        if lasts_us > WINDOW_US or (lasts_us > DECIDED_US and not self._vehicle.is_known):
+            self._array, self._other = self._other, None
+
+    def _believes(self, time_us: int, received_us: int) -> bool:
+        """Whether the vehicle's time may be taken; it tells which clock has jumped, if one has."""
+        has_gone_back = self._told_us - time_us > SAME_CLOCK_US
+        self._told_us = time_us
+        if has_gone_back:
+            self._vehicle = Lead()
+        off_us = self._vehicle.off(time_us, received_us)
+        if self._other:
+            if received_us - self._other_since_us > DECIDED_US:
+                self._decide(self._other, off_us, received_us)
+                off_us = self._vehicle.off(time_us, received_us)
+        elif off_us:
+            self._odd_since_us = self._odd_since_us or received_us
+            patience_us = 2 * DECIDED_US if off_us > 0 else WINDOW_US
+            if received_us - self._odd_since_us > patience_us:
+                self._vehicle, off_us = Lead(), 0
+        if not off_us:
+            self._odd_since_us = 0
+        return not off_us
+
+    def _decide(self, other: Lead, off_us: int, received_us: int) -> None:
+        """Say why epochs are out of the way, given how far the vehicle's time is."""
+        jump_us = other.at(received_us) - self._array.at(received_us)
+        if abs(off_us - jump_us) < abs(jump_us) / 2:
+            self._array.shift(jump_us)
+            self._vehicle.shift(jump_us)
+            self._other = None
+        elif jump_us > 0:
+            self._array, self._other = other, None
 
     def _steady(self, stamp_us: int) -> int:
         """A stamp that does not go back a little."""
