@@ -128,9 +128,9 @@ def test_the_least_delayed_frame_counts_for_some_seconds():
 @pytest.mark.parametrize("drift", [-200, 200])  # microseconds a second
 def test_clocks_that_drift_are_followed(drift):
     bench = Bench()
-    for _ in range(300):
+    for second in range(300):
         bench.tell_time()
-        assert abs(bench.error_us()) <= 20 * abs(drift)
+        assert abs(bench.error_us()) <= (15 * abs(drift) if second < 15 else 2)
         bench.wait(1_000_000)
         bench.array_us += drift
 

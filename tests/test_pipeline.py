@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as public
 from vehicle import Vehicle
-from wire import imu
+from wire import array, debug_array, imu, info
 
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.heading import HeadingState
@@ -182,6 +182,34 @@ def test_a_reboot_keeps_the_heading(drive):
     assert after.elapsed - before.elapsed == pytest.approx(2.0)
     assert after.heading.yaw == pytest.approx(before.heading.yaw, abs=0.01)
     assert drive.pipeline.assembler.counts["clock_resets"] == 1
+
+
+READING = [(1, 2, 3)] * 3
+SENDERS = {
+    "GYRO_ARRAY": lambda time_us: array(time_us, READING, epoch_seq=time_us // PERIOD_US % 65536),
+    "DEBUG_FLOAT_ARRAY": lambda time_us: debug_array(time_us, b"gyro", READING),
+    "HIGHRES_IMU": lambda time_us: imu("HIGHRES_IMU", time_us),
+    "SCALED_IMU": lambda time_us: imu("SCALED_IMU", time_us),
+}
+
+
+@pytest.mark.parametrize("name", SENDERS)
+def test_time_goes_by_the_senders_own_clock_not_by_arrival(name):
+    random = np.random.default_rng(4)
+    pipeline = Pipeline(PipelineParameters(), OWN)
+    pipeline.step(info(), 0)
+    times_us = 5_000_000 + PERIOD_US * np.arange(300)
+    arrivals_us = times_us + random.integers(0, 5000, 300)
+    arrivals_us[150:] -= 40_000  # the receiver's clock is set
+    estimates = [
+        estimate
+        for time_us, received_us in zip(times_us.tolist(), arrivals_us.tolist(), strict=True)
+        for estimate in pipeline.step(SENDERS[name](time_us), received_us)
+    ]
+    assert len(estimates) > 290
+    steps = np.diff([estimate.elapsed for estimate in estimates])
+    assert steps == pytest.approx(PERIOD_US / 1e6, abs=1e-9)
+    assert set(np.diff([estimate.boot_us for estimate in estimates])) == {PERIOD_US}
 
 
 def test_boot_time_is_the_autopilots_for_an_array_with_a_clock_of_its_own(drive):
