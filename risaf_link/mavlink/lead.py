@@ -2,9 +2,10 @@
 
 A frame that tells a time and was d on its way tells the lead less d. No d is negative: what is told
 lies below the lead, which follows a line while both clocks run evenly. Estimated is the line that
-lies above all that was told in the last minute, and of those the lowest, on average, above it: an
-edge of the convex hull, the one at their mean time [1]_, [2]_. Of each second only the frame that
-was least delayed can matter, and is kept.
+lies above all that was told in the last minutes, and of those the lowest at their mean time [1]_:
+an edge of their convex hull [2]_. It goes through one point of the first third and one of the last,
+for an edge between two that are close to each other tells little of the slope. Of each spell of
+some seconds only the frame that was least delayed is kept; what has come since may lift the line.
 
 One way, the shortest delay is not seen. An answer to a request tells the lead from above, too: it
 cannot have been given before it was asked for. The truth is between, in the middle for want of
@@ -31,9 +32,10 @@ SPELL_US = 3_000_000  # of which the least delayed frame is kept
 WINDOW_US = 60 * SPELL_US  # long against delays, short against changes of temperature
 SKEW_SPAN_US = 10_000_000  # from which a skew can be told: a millisecond in it is 100 ppm
 LARGEST_SKEW = 1e-3  # of clocks that are in order; a steeper line is one of delays
-JUMP_US = 10_000  # off the line by more, beside what is usual, is a jump or a delay out of the way
-SETTLED = 5  # spells, before which nothing is usual
-GROSS_US = 500_000  # off the line by more is out of the way at any time
+SETTLED = 5  # spells, from which on it is known how far below the line times are told
+JUMP_US = 10_000  # off the line by more than that, and this, is out of the way
+GROSS_US = 500_000  # likewise before
+MOST_ANSWERS = 256  # one a second is asked for
 
 Times = NDArray[np.int64]
 
@@ -50,12 +52,12 @@ class Lead:
     def __init__(self) -> None:
         self.skew = 0.0
         self._at_us = self._base_us = 0  # a point of the line
-        self._usual_us = GROSS_US  # between the line and what was told
-        self._best: deque[tuple[int, int]] = deque()  # of each second: arrival, lead
-        self._since_us: int | None = None  # when the present second began
+        self._usual_us = GROSS_US  # off the line by more is out of the way
+        self._best: deque[tuple[int, int]] = deque()  # of each spell: arrival, lead
+        self._since_us: int | None = None  # when the present spell began
         self._present: tuple[int, int] | None = None  # its best
         self._above_us = 0  # how far that lies above the line
-        self._answers: deque[tuple[int, int]] = deque()  # when asked, lead from above
+        self._answers: deque[tuple[int, int]] = deque(maxlen=MOST_ANSWERS)  # asked, lead from above
         self._back_us = 0  # what the shortest way takes, as far as answers tell
 
     @property
@@ -103,21 +105,31 @@ class Lead:
         self._back_us = max(0, gap_us - max(0, self._above_us)) // 2
 
     def note_each(self, time_us: Times, received_us: Times) -> Times:
-        """Take the first of k times, (k,), that one second holds and the line; the lead at each."""
+        """Take times, (k,), up to the first that is out of the way or begins a spell.
+
+        Returns
+        -------
+        array
+            The lead at each that was taken, as `at` says it then.
+        """
         if self._since_us is None or self._present is None:
             return received_us[:0]
-        passed_us = received_us - self._since_us
+        lines_us = self._lines(received_us)
         leads_us = time_us - received_us
-        above_us = leads_us - self._lines(received_us)
-        highest_us = np.maximum.accumulate(np.maximum(above_us, max(0, self._above_us)))
-        before_us = np.concatenate(([max(0, self._above_us)], highest_us[:-1]))
-        usual = (passed_us >= 0) & (passed_us < SPELL_US)
-        usual &= np.abs(above_us - before_us) <= self._usual_us
-        count = len(usual) if usual.all() else int(usual.argmin())
+        above_us = leads_us - lines_us
+        lift_us = max(0, self._above_us)
+        passed_us = received_us - self._since_us
+        within = (passed_us >= 0) & (passed_us < SPELL_US)
+        highest_us = np.maximum.accumulate(np.maximum(above_us, lift_us))
+        lowest_us = min(lift_us, int(above_us.min()))
+        if highest_us[-1] - lowest_us > self._usual_us:  # else none is out of the way
+            before_us = np.concatenate(([lift_us], highest_us[:-1]))
+            within &= np.abs(above_us - before_us) <= self._usual_us
+        count = len(within) if within.all() else int(within.argmin())
         if count and (most_us := int(above_us[:count].max())) > self._above_us:
             i = int(above_us[:count].argmax())
             self._present, self._above_us = (int(received_us[i]), int(leads_us[i])), most_us
-        return (self._lines(received_us) + highest_us + self._back_us)[:count]
+        return (lines_us + highest_us + self._back_us)[:count]
 
     def shift(self, by_us: int) -> None:
         """Follow arrival times that were set back by so much."""
@@ -139,7 +151,7 @@ class Lead:
         return self._base_us + drift
 
     def _end_spell(self, received_us: int) -> None:
-        """Keep the best of a second, and draw the line anew."""
+        """Keep the best of a spell, and draw the line anew."""
         if self._present is not None:
             self._best.append(self._present)
         while len(self._best) > 1 and not 0 <= received_us - self._best[0][0] <= WINDOW_US:
@@ -158,7 +170,7 @@ class Lead:
 def _skew(times: Floats, leads: Floats) -> float:
     """Slope of the lowest line above points, (k,) each; 0 where none can be told.
 
-    Through a point before the mean time and one after it, the line that is highest there.
+    Through one point of the first third and one of the last, the line that is highest between.
     """
     span = float(times[-1] - times[0])
     if span < SKEW_SPAN_US:
