@@ -545,6 +545,57 @@ def test_whatever_is_commanded_is_answered_once_at_least(commands):
         network.wait(0.1)
 
 
+numbers = st.floats(width=32)
+byte = st.integers(0, 255)
+ORDERS = st.one_of(
+    st.tuples(
+        st.just("COMMAND_LONG"),
+        st.fixed_dictionaries(
+            {"command": st.integers(0, 65535), "confirmation": byte},
+            optional={f"param{i}": values for i in range(1, 8)},
+        ),
+    ),
+    st.tuples(
+        st.just("COMMAND_INT"),
+        st.fixed_dictionaries(
+            {"command": st.integers(0, 65535), "frame": byte},
+            optional={f"param{i}": values for i in range(1, 5)}
+            | {axis: st.integers(-(2**31), 2**31 - 1) for axis in "xy"}
+            | {"z": numbers},
+        ),
+    ),
+    st.tuples(
+        st.just("PARAM_SET"),
+        st.fixed_dictionaries(
+            {"param_id": st.binary(max_size=16), "param_value": numbers, "param_type": byte}
+        ),
+    ),
+    st.tuples(
+        st.just("PARAM_REQUEST_READ"),
+        st.fixed_dictionaries(
+            {"param_id": st.binary(max_size=16), "param_index": st.integers(-(2**15), 2**15 - 1)}
+        ),
+    ),
+    st.tuples(st.just("PARAM_REQUEST_LIST"), st.just({})),
+)
+
+
+@settings(max_examples=300)
+@given(orders=st.lists(ORDERS, max_size=10), is_armed=st.booleans(), runs=st.booleans())
+def test_whoever_asks_us_anything_is_answered(orders, is_armed, runs):
+    network = Network(keep=lambda _: None)
+    network.component.receive(heartbeat(1, base_mode=128 * is_armed), NEAR, 0)
+    for k, (name, fields) in enumerate(orders):
+        if runs:
+            network.estimate(at(1 + k / 10))
+        answers = network.send(name, **fields) + network.wait(0.2)[NEAR]
+        if "command" in fields:
+            assert fields["command"] in [command for command, _ in acks(answers)]
+        else:
+            assert of(answers, "PARAM_VALUE") + of(answers, "PARAM_ERROR")
+    assert of(network.wait(1.5)[FAR], "HEARTBEAT")
+
+
 @settings(max_examples=200)
 @given(
     name=st.sampled_from(
