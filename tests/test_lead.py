@@ -134,6 +134,9 @@ def test_a_link_that_stalls_moves_nothing(clocks, for_s):
     clocks.run(120)
     clocks.held_up_us = 3 * SECOND
     stalled = clocks.run(for_s)
+    now_us = clocks.second * SECOND
+    told_us = clocks.clock.now_us(clocks.unix_us + now_us)
+    assert abs(told_us - clocks.vehicle_us(now_us)) < 1500 + 100 * for_s
     clocks.held_up_us = 0
     assert np.abs(stalled).max() < 1500 + 100 * for_s  # the drift of clocks that are not compared
     assert np.abs(clocks.run(60)[RATE:]).max() < 1500

@@ -77,7 +77,8 @@ class VehicleClock:
         if not self._array.is_known:
             return received_us + (self._vehicle.at(received_us) if self._vehicle.is_known else 0)
         offset_us = self._offset_us if abs(self._offset_us) >= SAME_CLOCK_US else 0
-        return max(received_us + (self._other or self._array).at(received_us) + offset_us, 0)
+        leads_us = [each.at(received_us) for each in (self._array, self._other) if each]
+        return max(received_us + max(leads_us) + offset_us, 0)  # what is late may be held up
 
     def boot_us(self, time_us: int, received_us: int) -> int:
         """When the samples of an epoch were taken, which has just been received."""
