@@ -6,8 +6,6 @@ clock and the streams of that key. Both are replaced whole or not at all.
 
 import asyncio
 import logging
-import os
-import stat
 import threading
 from collections import Counter
 from collections.abc import Iterable
@@ -20,10 +18,10 @@ from risaf_link.config import Config
 from risaf_link.errors import ConfigError
 from risaf_link.kept import replace_file
 from risaf_link.mavlink.signing import KEY_SIZE, KeySnapshot, LinkSigning, SigningKey, SigningState
+from risaf_link.private import read_private
 
 PRIVATE = 0o600
 AGAIN_S = 5.0  # after what could not be stored; half of the clocks' reserve is 15 s
-OTHERS = stat.S_IRWXG | stat.S_IRWXO
 EXPECTED = f"{KEY_SIZE} bytes or {2 * KEY_SIZE} hexadecimal digits, not all zero"
 
 _log = logging.getLogger(__name__)
@@ -173,7 +171,7 @@ def _may_be_set_up(config: Config, path: Path) -> bool:
 
 
 def _read_secret(path: Path, where: str, may_be_missing: bool) -> bytes:
-    content = _read_private(path, where)
+    content = read_private(path, where)
     if content is None:
         if may_be_missing:
             return b""
@@ -191,7 +189,7 @@ def _read_secret(path: Path, where: str, may_be_missing: bool) -> bytes:
 
 
 def _read_state(path: Path, where: str) -> SigningState:
-    content = _read_private(state_path(path), where)
+    content = read_private(state_path(path), where)
     if content is None:
         return SigningState()
     try:
@@ -199,26 +197,3 @@ def _read_state(path: Path, where: str) -> SigningState:
     except msgspec.DecodeError:
         _log.warning("%sfound %s damaged: the clock starts anew", where, state_path(path).name)
         return SigningState()
-
-
-def _read_private(path: Path, where: str) -> bytes | None:
-    """Content of a file that nobody but its owner may read; None: there is none."""
-    try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            if status.st_mode & OTHERS:
-                mode = stat.S_IMODE(status.st_mode)
-                raise ConfigError(
-                    f"{where}found {path.name} with mode {mode:04o}, expected 0600 or 0400: "
-                    "readable by its owner alone"
-                )
-            if status.st_uid not in {0, os.geteuid()}:
-                raise ConfigError(
-                    f"{where}found {path.name} owned by user {status.st_uid}, "
-                    f"expected {os.geteuid()}, who runs this"
-                )
-            return file.read()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise ConfigError(f"{where}{error.strerror or error}") from None
