@@ -455,10 +455,13 @@ def check_config(file: Path) -> None:
     """
     from risaf_link.config import dump, load, load_calibration
     from risaf_link.keys import open_keys
+    from risaf_link.publish.access import broker_of
 
     config = load(file)
     load_calibration(config)
     open_keys(config)
+    if config.mqtt.url:
+        broker_of(config.mqtt)
     click.echo(dump(config), nl=False)
 
 

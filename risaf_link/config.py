@@ -25,6 +25,10 @@ from risaf_link.mavlink.requests import RequestedRates
 from risaf_link.mavlink.signing import SigningParameters
 from risaf_link.mavlink.telemetry import DEFAULT_RATES, Rates
 from risaf_link.pipeline import PipelineParameters
+from risaf_link.publish.access import MqttParameters
+from risaf_link.publish.access import check as check_mqtt
+from risaf_link.publish.scrape import MetricsParameters
+from risaf_link.publish.scrape import check as check_metrics
 
 Id = Annotated[int, Meta(ge=1, le=255)]
 RATE_NAMES = (
@@ -64,6 +68,8 @@ class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
         LinkParameters("vehicle", "udpin://127.0.0.1:14560"),
         LinkParameters("ground", "udpout://127.0.0.1:14550"),
     )
+    mqtt: MqttParameters = field(default_factory=MqttParameters)
+    metrics: MetricsParameters = field(default_factory=MetricsParameters)
 
     @property
     def own(self) -> tuple[int, int]:
@@ -105,6 +111,8 @@ def load(path: Path | None, settings: Iterable[str] = ()) -> Config:
         raise ConfigError(where + _explain(error, tree)) from None
     _check_links(where, config.links)
     _check_feeding(where, config)
+    check_mqtt(config.mqtt, where)
+    check_metrics(config.metrics, where)
     return config
 
 

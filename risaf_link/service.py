@@ -17,6 +17,7 @@ from risaf_link.config import Config, identity_of, load_calibration
 from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.kernel import BUILT
+from risaf_link.errors import ConfigError
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.keys import open_keys
 from risaf_link.links import Link, TlogLink, open_link
@@ -25,11 +26,14 @@ from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.component import HEARD, Component
 from risaf_link.mavlink.frame import FrameParser, FrameTable
 from risaf_link.mavlink.held import Held
+from risaf_link.mavlink.notices import Notice
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.requests import Requests
 from risaf_link.mavlink.signing import SETUP_SIGNING, Rejection
 from risaf_link.pipeline import Pipeline
+from risaf_link.publish.account import Account, Traffic
+from risaf_link.publish.output import Output
 
 TICK_S = 0.1  # from one look at what is due by time to the next
 OPENING = 20  # looks at whether the links are open, in the first TICK_S
@@ -130,6 +134,7 @@ class Service:
                 config.gps.messages,
                 {link.name: link.bytes_per_s for link in self.links},
             ),
+            listen=self._tell,
         )
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
@@ -141,12 +146,17 @@ class Service:
         self._holding: Peer = ("", "")  # whose datagrams wait
         self._frames = 0
         self._received_us = 0
+        self._began_ns = 0  # when that was, on the clock of latencies
+        self._frames_in: Counter[str] = Counter()  # by link
+        self._frames_out: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()  # from peers that are forgotten
         self._mismatch = ""
+        self._outputs = self._open_outputs(config)
 
     @property
     def dropped(self) -> Counter[str]:
-        """Frames that were lost in parsing, by reason, from the peers that are remembered."""
-        return sum((parser.dropped for parser in self._parsers.values()), Counter())
+        """Frames that were lost in parsing, by reason."""
+        return sum((parser.dropped for parser in self._parsers.values()), self._dropped)
 
     @property
     def rejected(self) -> Counter[str]:
@@ -171,6 +181,8 @@ class Service:
             async with asyncio.TaskGroup() as tasks:
                 for link in self.links:
                     tasks.create_task(link.run(partial(self._receive, link)))
+                for output in self._outputs:
+                    tasks.create_task(self._run_output(output))
                 try:
                     await self._beat()
                 finally:  # the links are still open
@@ -197,10 +209,12 @@ class Service:
             self._take(self._held.take(), self._holding)
 
     def _take(self, data: bytes, sender: Peer) -> None:
+        self._began_ns = time.perf_counter_ns()
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
         self._keys.advance(received_us)
         table = self._accepted(self._parser(*sender).receive_table(data), sender[0])
         self._frames += len(table)
+        self._frames_in[sender[0]] += len(table)
         self._record(table, received_us)
         self._component.note_traffic(table, sender)
         for item in self._blocks.read(table, np.full(len(table), received_us, np.uint64)):
@@ -234,9 +248,14 @@ class Service:
     def _send(self, blocks: list[EstimateBlock]) -> None:
         for block in blocks:
             peers = list(self._peers())
-            for estimate in block:
+            for estimate, received_us in zip(block, block.received_us.tolist(), strict=True):
                 self._component.observe(estimate)
                 self._hand_out(self._component.emit(estimate, peers))
+                for output in self._outputs:
+                    try:
+                        output.take(estimate, received_us, self._began_ns)
+                    except Exception:
+                        self._leave_out(output)
 
     def _peers(self) -> Iterator[Peer]:
         return ((link.name, peer) for link in self.links for peer in link.peers)
@@ -244,6 +263,7 @@ class Service:
     def _hand_out(self, frames: list[tuple[Peer, bytes]]) -> None:
         for (link, peer), raw in frames:
             self._by_name[link].send_to(raw, peer)
+            self._frames_out[link] += 1
 
     def _keep(self, parameters: dict[str, float]) -> None:
         """Store parameters without waiting: a memory card can take longer than an epoch."""
@@ -279,8 +299,69 @@ class Service:
         parser = self._parsers.pop((link, peer), None) or FrameParser()
         self._parsers[link, peer] = parser  # the one that spoke last is last
         if len(self._parsers) > MOST_PEERS:
-            del self._parsers[next(iter(self._parsers))]
+            self._dropped += self._parsers.pop(next(iter(self._parsers))).dropped
         return parser
+
+    # Outputs that are not MAVLink
+
+    def account(self) -> Account:
+        """What has come and gone, as of now."""
+        return Account(
+            dropped=self.dropped,
+            rejected=self.rejected,
+            assembly=self.pipeline.assembler.counts,
+            unused=self.pipeline.ingest.counts,
+            links=[
+                Traffic(
+                    link.name,
+                    *(link.counts.bytes_in, link.counts.bytes_out),
+                    *(self._frames_in[link.name], self._frames_out[link.name]),
+                    *(link.counts.dropped_out, link.counts.connections, len(link.peers)),
+                )
+                for link in self.links
+            ],
+        )
+
+    def _open_outputs(self, config: Config) -> list[Output]:
+        """Make those that are configured; they bring libraries, which take their time."""
+        outputs: list[Output] = []
+        mqtt = None
+        if config.mqtt.url:
+            from risaf_link.publish.mqtt import MqttPublisher
+
+            mqtt = MqttPublisher(config.mqtt)
+            outputs.append(mqtt)
+        if config.metrics.listen:
+            try:
+                from risaf_link.publish.metrics import Metrics
+            except ImportError:
+                raise ConfigError(
+                    "metrics.listen: needs prometheus-client: install risaf-link with the extra "
+                    "`metrics`"
+                ) from None
+            metrics = Metrics(config.metrics, self.account, mqtt.counts if mqtt else None)
+            outputs.insert(0, metrics)  # what the others take is no latency of ours
+        return outputs
+
+    def _tell(self, notice: Notice) -> None:
+        """Let outputs know what the operator is told."""
+        unix_us = self._clock_us()
+        for output in self._outputs:
+            try:
+                output.tell(notice, self.pipeline.now_us(unix_us), unix_us)
+            except Exception:
+                self._leave_out(output)
+
+    async def _run_output(self, output: Output) -> None:
+        try:
+            await output.run()
+        except Exception:
+            self._leave_out(output)
+
+    def _leave_out(self, output: Output) -> None:
+        """Go on without an output that has failed."""
+        _log.exception("%s has failed and is left out", type(output).__name__)
+        self._outputs = [other for other in self._outputs if other is not output]
 
     def _tell_mismatch(self) -> None:
         if self.pipeline.mismatch != self._mismatch:

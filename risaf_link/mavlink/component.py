@@ -90,6 +90,8 @@ class Component:
         Begins to store parameters, by name, whose end is told by `kept`; None: there is no place.
     requests : Requests or None
         For what the autopilot is asked; None: for nothing.
+    listen : callable or None
+        Takes every notice as it is told.
 
     Attributes
     ----------
@@ -106,6 +108,7 @@ class Component:
         links: Mapping[str, Terms] | None = None,
         keep: Callable[[dict[str, float]], None] | None = None,
         requests: Requests | None = None,
+        listen: Callable[[Notice], None] | None = None,
     ) -> None:
         self.trouble = ""
         self._parameters = parameters
@@ -122,6 +125,7 @@ class Component:
         self._tuning = Tuning(parameters)
         self._notices = Notices()
         self._told = 0  # notices
+        self._listen = listen
         self._outbox: list[tuple[Peer | None, str, dict[str, Any]]] = []  # None: to all
         self._estimate: Estimate | None = None
         self._received_us = 0
@@ -261,6 +265,8 @@ class Component:
         self._told += 1
         for fields in statustexts(notice, self._told):
             self._outbox.append((None, "STATUSTEXT", fields))
+        if self._listen:
+            self._listen(notice)
 
     def _adopt(self) -> None:
         """Speak under the vehicle's system id from now on."""

@@ -1,0 +1,184 @@
+"""A connection to an MQTT broker, by aiomqtt, which is imported nowhere else: it takes its time.
+
+A thread resolves the name, connects and shakes hands; all else happens in the event loop. Trouble
+of any kind is a ConnectionError that says what it was.
+"""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from typing import NoReturn
+
+import aiomqtt
+from paho.mqtt.enums import MQTTErrorCode
+from paho.mqtt.reasoncodes import ReasonCode
+
+from risaf_link.publish.access import Broker
+
+CONNECT_S = 5.0  # for a TCP connection, and for the handshake of TLS
+ANSWER_S = 5.0  # for whatever the broker has to answer, and for what is written to leave
+LEAVE_S = 1.0  # for a farewell
+SEND_BUFFER = 65536  # bytes; what lies in it is not the newest any more
+WRONG_PROTOCOL = {1, 132}  # reasons of MQTT 3.1.1 and 5
+SOCKET_OPTIONS = (
+    (socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER),
+    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
+)
+NO_ANSWER = "no answer"
+MOST_PENDING = 100  # calls; aiomqtt would warn of ten
+
+_quiet = logging.getLogger(f"{__name__}.client")
+_quiet.setLevel(logging.CRITICAL + 1)  # what matters is in the exceptions
+
+
+class ProtocolRefusedError(ConnectionError):
+    """The broker does not speak this version of MQTT."""
+
+
+class NoAnswerError(ConnectionError):
+    """Somebody is there, but does not answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """What is published."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class _Client(aiomqtt.Client):
+    """A client that tells when its thread has ended, and can be dropped."""
+
+    def __init__(self, broker: Broker, will: Message, version: int) -> None:
+        self.thread_ended = asyncio.Event()
+        five = version == 5
+        super().__init__(
+            broker.host,
+            broker.port,
+            username=broker.user,
+            password=broker.password,
+            tls_context=broker.tls,
+            identifier=broker.client_id,
+            protocol=aiomqtt.ProtocolVersion.V5 if five else aiomqtt.ProtocolVersion.V311,
+            clean_session=None if five else True,
+            clean_start=True,
+            will=aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
+            keepalive=broker.keepalive,
+            timeout=ANSWER_S,
+            socket_options=SOCKET_OPTIONS,
+            logger=_quiet,
+        )
+        self.pending_calls_threshold = MOST_PENDING
+        self._client.connect_timeout = CONNECT_S
+
+    def _client_connect(self) -> None:
+        try:
+            super()._client_connect()
+        finally:
+            self._loop.call_soon_threadsafe(self.thread_ended.set)
+
+    def drop(self) -> None:
+        """Close the socket, without a word: the broker then publishes the last will."""
+        self._client._sock_close()  # noqa: SLF001 there is no other way that says no DISCONNECT
+        for future in (self._connected, self._disconnected):
+            if future.done() and not future.cancelled():
+                future.exception()  # it has been seen
+
+
+class Session:
+    """A connection that stands."""
+
+    def __init__(self, client: _Client) -> None:
+        self._client = client
+
+    async def publish(self, message: Message) -> None:
+        """Publish, and wait: at QoS 0 until it is written, else until the broker has it.
+
+        Raises
+        ------
+        ConnectionError
+        """
+        try:
+            await self._client.publish(message.topic, message.payload, message.qos, message.retain)
+        except aiomqtt.MqttError as error:
+            raise ConnectionError(_reason(error)) from None
+
+    async def lost(self) -> NoReturn:
+        """Wait until the connection is lost.
+
+        Raises
+        ------
+        ConnectionError
+            When it is.
+        """
+        try:
+            async for _ in self._client.messages:
+                pass
+        except aiomqtt.MqttError as error:
+            raise ConnectionError(_reason(error.__cause__ or error)) from None
+        raise ConnectionError("closed by the broker")
+
+    async def leave(self) -> None:
+        """Say goodbye: there is no last will then."""
+        with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+            async with asyncio.timeout(LEAVE_S):
+                await self._client.__aexit__(None, None, None)
+
+
+@contextlib.asynccontextmanager
+async def connected(broker: Broker, will: Message, version: int) -> AsyncIterator[Session]:
+    """Connect, and drop the connection at the end, unless the session has left.
+
+    Parameters
+    ----------
+    broker : Broker
+    will : Message
+        What the broker publishes when we vanish.
+    version : int
+        Of MQTT: 5, or 4 for 3.1.1.
+
+    Raises
+    ------
+    ConnectionError
+        It cannot be had. `ProtocolRefusedError`: not in this version; `NoAnswerError`: there is
+        somebody, who does not answer.
+    """
+    client = _Client(broker, will, version)
+    entering = asyncio.ensure_future(client.__aenter__())
+    try:
+        await asyncio.shield(entering)
+        yield Session(client)
+    except aiomqtt.MqttCodeError as error:  # the broker's answer
+        code = error.rc.value if isinstance(error.rc, ReasonCode) else error.rc
+        kind = ProtocolRefusedError if code in WRONG_PROTOCOL else ConnectionRefusedError
+        raise kind(f"refused: {_words(error.rc)}") from None
+    except aiomqtt.MqttError as error:
+        reason = _reason(error)
+        raise (NoAnswerError if reason == NO_ANSWER else ConnectionError)(reason) from None
+    finally:
+        if not entering.done():  # a thread cannot be interrupted
+            await client.thread_ended.wait()
+            entering.cancel()
+            await asyncio.wait([entering])
+        if not entering.cancelled():
+            entering.exception()
+        client.drop()
+
+
+def _reason(error: BaseException) -> str:
+    """What went wrong, in a few words."""
+    if isinstance(error, aiomqtt.MqttCodeError):
+        lost = {MQTTErrorCode.MQTT_ERR_CONN_LOST, MQTTErrorCode.MQTT_ERR_NO_CONN}
+        return "connection lost" if error.rc in lost else _words(error.rc)
+    text = str(error)
+    return NO_ANSWER if text == "Operation timed out" else text or type(error).__name__
+
+
+def _words(code: ReasonCode | int | None) -> str:
+    return code.getName() if isinstance(code, ReasonCode) else str(code)
