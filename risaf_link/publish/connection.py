@@ -8,9 +8,11 @@ import asyncio
 import contextlib
 import logging
 import socket
+import threading
+import traceback
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import aiomqtt
 from paho.mqtt.enums import MQTTErrorCode
@@ -27,7 +29,8 @@ SOCKET_OPTIONS = (
     (socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER),
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
 )
-NO_ANSWER = "no answer"
+LOST = {MQTTErrorCode.MQTT_ERR_NO_CONN, MQTTErrorCode.MQTT_ERR_CONN_LOST, 128}  # unspecified
+NO_ANSWER, TIMED_OUT = "no answer", "Operation timed out"  # our word, and aiomqtt's
 MOST_PENDING = 100  # calls; aiomqtt would warn of ten
 
 _quiet = logging.getLogger(f"{__name__}.client")
@@ -53,10 +56,11 @@ class Message:
 
 
 class _Client(aiomqtt.Client):
-    """A client that tells when its thread has ended, and can be dropped."""
+    """A client that can be dropped, and that notices when a broker closes without an answer."""
 
     def __init__(self, broker: Broker, will: Message, version: int) -> None:
         self.thread_ended = asyncio.Event()
+        self._loop_thread = threading.get_ident()
         five = version == 5
         super().__init__(
             broker.host,
@@ -67,7 +71,6 @@ class _Client(aiomqtt.Client):
             identifier=broker.client_id,
             protocol=aiomqtt.ProtocolVersion.V5 if five else aiomqtt.ProtocolVersion.V311,
             clean_session=None if five else True,
-            clean_start=True,
             will=aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
             keepalive=broker.keepalive,
             timeout=ANSWER_S,
@@ -77,18 +80,41 @@ class _Client(aiomqtt.Client):
         self.pending_calls_threshold = MOST_PENDING
         self._client.connect_timeout = CONNECT_S
 
-    def _client_connect(self) -> None:
-        try:
-            super()._client_connect()
-        finally:
-            self._loop.call_soon_threadsafe(self.thread_ended.set)
-
     def drop(self) -> None:
         """Close the socket, without a word: the broker then publishes the last will."""
-        self._client._sock_close()  # noqa: SLF001 there is no other way that says no DISCONNECT
+        self._client._sock_close()  # noqa: SLF001 all else would say DISCONNECT
         for future in (self._connected, self._disconnected):
             if future.done() and not future.cancelled():
                 future.exception()  # it has been seen
+
+    def _client_connect(self) -> None:
+        try:
+            super()._client_connect()
+        except BaseException as error:
+            traceback.clear_frames(error.__traceback__)  # one of them holds a socket open
+            raise
+        finally:
+            self._loop.call_soon_threadsafe(self.thread_ended.set)
+
+    def _on_disconnect(self, *args: Any) -> None:
+        if self._connected.done():
+            super()._on_disconnect(*args)
+        else:  # aiomqtt would go on waiting
+            self._connected.set_exception(aiomqtt.MqttError(NO_ANSWER))
+
+    def _on_socket_register_write(self, client: Any, userdata: Any, sock: Any) -> None:
+        """Watch for room from now on: a turn later, the number of the socket may be another's."""
+        if threading.get_ident() == self._loop_thread:
+            self._loop.add_writer(sock.fileno(), self._write)
+        else:
+            super()._on_socket_register_write(client, userdata, sock)
+
+    def _write(self) -> None:
+        try:
+            self._client.loop_write()
+        except Exception as error:
+            if not self._disconnected.done():
+                self._disconnected.set_exception(error)
 
 
 class Session:
@@ -155,8 +181,8 @@ async def connected(broker: Broker, will: Message, version: int) -> AsyncIterato
         await asyncio.shield(entering)
         yield Session(client)
     except aiomqtt.MqttCodeError as error:  # the broker's answer
-        code = error.rc.value if isinstance(error.rc, ReasonCode) else error.rc
-        kind = ProtocolRefusedError if code in WRONG_PROTOCOL else ConnectionRefusedError
+        wrong = _number(error.rc) in WRONG_PROTOCOL
+        kind = ProtocolRefusedError if wrong else ConnectionRefusedError
         raise kind(f"refused: {_words(error.rc)}") from None
     except aiomqtt.MqttError as error:
         reason = _reason(error)
@@ -174,10 +200,13 @@ async def connected(broker: Broker, will: Message, version: int) -> AsyncIterato
 def _reason(error: BaseException) -> str:
     """What went wrong, in a few words."""
     if isinstance(error, aiomqtt.MqttCodeError):
-        lost = {MQTTErrorCode.MQTT_ERR_CONN_LOST, MQTTErrorCode.MQTT_ERR_NO_CONN}
-        return "connection lost" if error.rc in lost else _words(error.rc)
+        return "connection lost" if _number(error.rc) in LOST else _words(error.rc)
     text = str(error)
-    return NO_ANSWER if text == "Operation timed out" else text or type(error).__name__
+    return NO_ANSWER if text == TIMED_OUT else text or type(error).__name__
+
+
+def _number(code: ReasonCode | int | None) -> int | None:
+    return code.value if isinstance(code, ReasonCode) else code
 
 
 def _words(code: ReasonCode | int | None) -> str:

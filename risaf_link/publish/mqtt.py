@@ -117,7 +117,7 @@ class MqttPublisher:
         self._events_published = self._events_dropped = 0
         self._has_states, self._has_events = asyncio.Event(), asyncio.Event()
         self._newest = self._version = 5  # of MQTT, that may be spoken and that is tried next
-        self._is_up = False
+        self._is_up = self._is_ending = False
         self._connections = 0
         self._up_s: float | None = None  # when the last connection came up
         self._reason = ""  # why there is none, as told last
@@ -180,8 +180,7 @@ class MqttPublisher:
                 self._go_down(str(error) or type(error).__name__)
                 self._choose_version(error)
             except Exception as error:
-                _log.exception("mqtt: an error of ours")
-                self._go_down(repr(error))
+                self._go_down(f"an error of ours: {error!r}", error)
             if self._stood_s() >= self._pauses.longest_s:
                 pause_s = self._pauses.first_s
             await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 no secret
@@ -198,7 +197,6 @@ class MqttPublisher:
         will = self._state("availability", topics.encode(offline), 1)
         async with connected(self._broker, will, self._version) as session:
             try:
-                await self._greet(session)
                 await self._publish_all(session)
             except asyncio.CancelledError:
                 farewell = asyncio.create_task(self._take_leave(session, will))
@@ -210,11 +208,18 @@ class MqttPublisher:
                 self._is_up = False
 
     async def _publish_all(self, session: Session) -> None:
-        """Publish until the connection is lost."""
-        works = session.lost(), self._publish_states(session), self._publish_events(session)
-        tasks = [asyncio.ensure_future(work) for work in works]
+        """Publish until the connection is lost; when cancelled, first the events that wait."""
+        works = session.lost(), self._publish_events(session), self._publish_states(session)
+        tasks = lost, events, _ = [asyncio.ensure_future(work) for work in works]
         try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        except asyncio.CancelledError:
+            self._is_ending = True
+            self._has_events.set()
+            await asyncio.wait(
+                [lost, events], timeout=FAREWELL_S, return_when=asyncio.FIRST_COMPLETED
+            )
+            raise
         finally:
             for task in tasks:
                 task.cancel()
@@ -232,10 +237,10 @@ class MqttPublisher:
             if topic.last and not topic.waiting:
                 topic.waiting.append(topic.last)
         self._has_states.set()
-        self._has_events.set()
         self._come_up()
 
     async def _publish_states(self, session: Session) -> None:
+        await self._greet(session)
         while True:
             await self._has_states.wait()
             self._has_states.clear()
@@ -253,7 +258,8 @@ class MqttPublisher:
         topic.published += 1
 
     async def _publish_events(self, session: Session) -> None:
-        while True:
+        self._has_events.set()  # some may have been left
+        while not self._is_ending:
             await self._has_events.wait()
             self._has_events.clear()
             while self._events:
@@ -274,10 +280,8 @@ class MqttPublisher:
         self._events_published += len(batch)
 
     async def _take_leave(self, session: Session, offline: Message) -> None:
-        """Publish what still waits, and go."""
+        """Say that we go, and go."""
         try:
-            while self._events:
-                await self._publish_some(session)
             await session.publish(offline)
         except OSError:
             return
@@ -290,15 +294,17 @@ class MqttPublisher:
 
     def _come_up(self) -> None:
         self._is_up = True
+        self._newest = self._version
         self._connections += 1
         self._up_s = asyncio.get_running_loop().time()
         version = "5" if self._version == 5 else "3.1.1"
         _log.info("mqtt: up: %s:%d, MQTT %s", self._broker.host, self._broker.port, version)
 
-    def _go_down(self, reason: str) -> None:
-        """Say why there is no connection, once."""
+    def _go_down(self, reason: str, error: Exception | None = None) -> None:
+        """Say why there is no connection, once; with a traceback, if it is an error of ours."""
         if self._up_s is not None or reason != self._reason:
-            _log.warning("mqtt: down: %s:%d: %s", self._broker.host, self._broker.port, reason)
+            where = self._broker.host, self._broker.port
+            _log.warning("mqtt: down: %s:%d: %s", *where, reason, exc_info=error)
         self._reason = reason
 
     def _stood_s(self) -> float:
