@@ -103,6 +103,7 @@ class Mosquitto(Running):
             *self._lines,
             "max_queued_messages 100000",
             "queue_qos0_messages true",
+            "set_tcp_nodelay true",
             "persistence true",
             f"persistence_location {self.directory}/",
             *(["user root"] if os.geteuid() == 0 else []),

@@ -9,6 +9,7 @@ import yaml
 
 from risaf_link.config import Config, dump, load, load_calibration
 from risaf_link.errors import ConfigError
+from risaf_link.publish.access import PASSWORD, MqttParameters, address, broker_of
 
 EXAMPLE = Path(__file__).parents[1] / "config" / "risaf_link.yaml"
 
@@ -99,6 +100,22 @@ def test_settings_go_over_the_file(tmp_path):
             "fusion: {alpha: 0.9}\nfusion: {alpha: 0.8}",
             "line 2: fusion: found twice, expected once",
         ),
+        ("mqtt: {url: 'tcp://x'}", "mqtt.url: found something else, expected mqtt://HOST:PORT or"),
+        ("mqtt: {url: 'mqtt://x:0'}", "mqtt.url: found something else, expected "),
+        ("mqtt: {vehicle: a/b}", "mqtt.vehicle: found 'a/b', expected str matching regex"),
+        ("mqtt: {prefix: 'a/#'}", "mqtt.prefix: found 'a/#', expected str matching regex"),
+        ("mqtt: {password: x}", "mqtt.password: unknown key; known: url, prefix, vehicle"),
+        ("mqtt: {qos: {events: 0}}", "mqtt.qos.events: found 0, expected one of 1, 2"),
+        ("mqtt: {rates: {events: 1}}", "mqtt.rates.events: unknown key; known: attitude"),
+        (
+            "mqtt: {url: 'mqtt://x', ca: ca.pem}",
+            "mqtt.ca: found it with 'mqtt://x', expected mqtts://",
+        ),
+        (
+            "mqtt: {url: 'mqtts://x', certificate: own.pem}",
+            "mqtt.key: found nothing, expected a file beside the other",
+        ),
+        ("metrics: {listen: ':9100'}", "metrics.listen: found ':9100', expected ADDRESS:PORT"),
         ("- 1", "found [1], expected keys with values"),
         ("fusion: {", "while parsing a flow"),
         ("a: b: c", "mapping values are not allowed here"),
@@ -170,3 +187,65 @@ class TestCalibrationFile:
     def test_it_must_be_for_as_many_sensors_as_configured(self, tmp_path):
         with pytest.raises(ConfigError, match=r"array\.sensors: found 3, expected 1"):
             self.load(tmp_path, "gyros: [{}]", "array.sensors=3")
+
+
+class TestMqttSecrets:
+    """No password is printed, whatever is wrong with it."""
+
+    def chosen(self, **keys):
+        return MqttParameters(url="mqtts://broker.example", user="rover", vehicle="v", **keys)
+
+    def test_a_password_in_the_url_is_refused_and_not_repeated(self, tmp_path):
+        path = written(tmp_path / "c.yaml", "mqtt: {url: 'mqtt://rover:hunter2@broker:1883'}")
+        with pytest.raises(ConfigError, match="in keys of their own") as caught:
+            load(path)
+        assert "hunter2" not in str(caught.value)
+
+    def test_the_environment_or_the_file_says_it_and_nothing_shows_it(self, tmp_path, monkeypatch):
+        monkeypatch.setenv(PASSWORD, "hunter2")
+        from_environment = broker_of(self.chosen())
+        secret = tmp_path / "secret"
+        secret.touch(0o600)
+        secret.write_text("hunter3\n")
+        from_file = broker_of(self.chosen(password_file=str(secret)))
+        assert (from_environment.password, from_file.password) == ("hunter2", "hunter3")
+        config = msgspec.structs.replace(Config(), mqtt=self.chosen(password_file=str(secret)))
+        for text in (repr(from_environment), repr(from_file), dump(config)):
+            assert "hunter" not in text
+
+    def test_a_file_that_others_may_read_is_refused(self, tmp_path):
+        secret = written(tmp_path / "secret", "hunter2")
+        secret.chmod(0o640)
+        with pytest.raises(ConfigError, match=r"mqtt\.password_file: .* mode 0640") as caught:
+            broker_of(self.chosen(password_file=str(secret)))
+        assert "hunter2" not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("keys", "message"),
+        [
+            ({"password_file": "none"}, "mqtt.password_file: none: found no file"),
+            ({"ca": "none.pem"}, "mqtt.ca: none.pem: No such file or directory, expected PEM"),
+            (
+                {"certificate": "none.pem", "key": "none.key"},
+                "mqtt.certificate: none.pem with none.key: No such file or directory, expected",
+            ),
+        ],
+    )
+    def test_a_file_that_is_not_there_is_named(self, keys, message):
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            broker_of(self.chosen(**keys))
+
+    @pytest.mark.parametrize(
+        ("url", "expected"),
+        [
+            ("mqtt://broker", (False, "broker", 1883)),
+            ("mqtts://broker.example/", (True, "broker.example", 8883)),
+            ("mqtt://10.0.0.1:2000", (False, "10.0.0.1", 2000)),
+            ("mqtts://[fe80::1]:99", (True, "fe80::1", 99)),
+            ("mqtt://a:70000", None),
+            ("mqtt://a b", None),
+            ("http://a", None),
+        ],
+    )
+    def test_a_brokers_url(self, url, expected):
+        assert address(url) == expected

@@ -206,14 +206,14 @@ class TestNothingToldIsLost:
             publishing(parameters(proxy.port, events_kept=100_000)) as publisher,
         ):
             for k in range(20):
-                for _ in range(50):
+                for _ in range(20):
                     publisher.tell(NOTICE, 0, 0)
                 until_cut = proxy.connections + k % 2  # now and then one that just begins
                 await until(lambda n=until_cut: proxy.connections >= n)
                 for _ in range(7 * k):  # some way into the handshake, the greeting, the events
                     await asyncio.sleep(0)
                 proxy.cut()
-            await until(lambda: set(numbers(listener)) == set(range(1, 1001)))
+            await until(lambda: set(numbers(listener)) == set(range(1, 401)))
             await until(lambda: publisher.counts().waiting["events"] == 0)
         assert proxy.connections > 5
 

@@ -117,6 +117,7 @@ class MqttPublisher:
         self._events_published = self._events_dropped = 0
         self._has_states, self._has_events = asyncio.Event(), asyncio.Event()
         self._newest = self._version = 5  # of MQTT, that may be spoken and that is tried next
+        self._is_certain = False  # that it is spoken
         self._is_up = self._is_ending = False
         self._connections = 0
         self._up_s: float | None = None  # when the last connection came up
@@ -188,8 +189,8 @@ class MqttPublisher:
 
     def _choose_version(self, error: OSError) -> None:
         """What is tried next: one that does not know MQTT 5 may just be silent."""
-        silent = isinstance(error, NoAnswerError) and self._version > OLDEST
-        self._version = OLDEST if silent else self._newest
+        silent = isinstance(error, NoAnswerError) and not self._is_certain
+        self._version = OLDEST if silent and self._version > OLDEST else self._newest
 
     async def _hold(self) -> None:
         """Connect, and publish until the connection is lost."""
@@ -294,7 +295,7 @@ class MqttPublisher:
 
     def _come_up(self) -> None:
         self._is_up = True
-        self._newest = self._version
+        self._newest, self._is_certain = self._version, True
         self._connections += 1
         self._up_s = asyncio.get_running_loop().time()
         version = "5" if self._version == 5 else "3.1.1"

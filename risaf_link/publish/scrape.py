@@ -5,6 +5,7 @@ It is read, never written to. Whoever is slow is waited for apart, and not for l
 
 import asyncio
 import logging
+import os
 import re
 from collections.abc import Awaitable, Callable
 
@@ -79,7 +80,7 @@ class Page:
             try:
                 await self._serve()
             except OSError as error:
-                reason = error.strerror or str(error)
+                reason = os.strerror(error.errno) if error.errno else str(error)
                 if reason != told:
                     _log.warning("metrics: down: %s:%d: %s", self._host, self.port, reason)
                 told = reason
