@@ -8,15 +8,21 @@ import inspect
 import re
 import sys
 from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from msgspec import Struct
 
 from risaf_link.config import Config
 from risaf_link.mavlink.parameters import Parameter, Parameters, parameters_of
+from risaf_link.publish.topics import MESSAGES
 
 ROOT = Path(__file__).parents[1]
 PAGE, EXAMPLE = ROOT / "docs" / "mavlink.md", ROOT / "config" / "risaf_link.yaml"
 BEGIN, END = "<!-- parameters: tests/manual.py writes them -->\n", "<!-- end -->\n"
+TOPICS_PAGE = ROOT / "docs" / "mqtt.md"
+IN_ALL = {"schema", "time_us", "unix_us"}  # fields of messages
+TOPICS_BEGIN = "<!-- topics: tests/manual.py writes them -->\n"
 
 
 def documented() -> list[tuple[Parameter, str]]:
@@ -49,6 +55,38 @@ def page() -> str:
     """The page, with the table that is right."""
     head, _, rest = PAGE.read_text().partition(BEGIN)
     return head + BEGIN + table() + END + rest.partition(END)[2]
+
+
+def topics_page() -> str:
+    """The page on MQTT, with the messages as they are."""
+    head, _, rest = TOPICS_PAGE.read_text().partition(TOPICS_BEGIN)
+    parts = []
+    for topic, message in MESSAGES.items():
+        parts.append(f"**`{topic}`** {message.__doc__}\n")
+        hints = get_type_hints(message, include_extras=True)
+        rows = [
+            f"| `{name}` | {_kind(hint)} | {_meant(hint)} |"
+            for name, hint in hints.items()
+            if name not in IN_ALL or topic == "availability"
+        ]
+        parts.append("\n".join(["| field | is | |", "|---|---|---|", *rows]) + "\n")
+    return head + TOPICS_BEGIN + "\n" + "\n".join(parts) + "\n" + END + rest.partition(END)[2]
+
+
+def _kind(hint: Any) -> str:
+    """What JSON has there."""
+    names = {int: "integer", float: "number", str: "string", type(None): "null"}
+    if get_args(hint) and get_origin(hint) in {Annotated, UnionType}:
+        parts = get_args(hint) if get_origin(hint) is UnionType else get_args(hint)[:1]
+        return " or ".join(_kind(part) for part in parts)
+    if get_origin(hint) is list:
+        return f"[{_kind(get_args(hint)[0])}, ...]"
+    return names[hint]
+
+
+def _meant(hint: Any) -> str:
+    """What a field's annotation says of it."""
+    return str(next(note.description for note in hint.__metadata__ if note.description))
 
 
 def example() -> str:
@@ -100,5 +138,6 @@ def _docstrings(schema: type[Struct]) -> dict[str, str]:
 
 if __name__ == "__main__":
     PAGE.write_text(page())
+    TOPICS_PAGE.write_text(topics_page())
     EXAMPLE.write_text(example())
     sys.exit()

@@ -9,6 +9,10 @@ def test_the_page_has_every_parameter_as_it_is():
     assert manual.PAGE.read_text() == manual.page()
 
 
+def test_the_page_on_mqtt_has_every_field_as_it_is():
+    assert manual.TOPICS_PAGE.read_text() == manual.topics_page()
+
+
 def test_the_example_says_of_every_parameter_what_the_page_says():
     assert manual.EXAMPLE.read_text() == manual.example()
 

@@ -130,11 +130,17 @@ def _percentile(values: Sequence[float], percent: int) -> float:
 
 
 @contextmanager
-def service(meter: Meter, command: Sequence[str], rate: float = 100.0) -> Iterator[int]:
-    """Run the service beside a meter, for every epoch an attitude; its process id."""
+def service(
+    meter: Meter, command: Sequence[str], rate: float = 100.0, settings: Sequence[str] = ()
+) -> Iterator[int]:
+    """Run the service beside a meter, for every epoch an attitude; its process id.
+
+    `settings` are `KEY=VALUE` over the defaults.
+    """
     emit = f"emit: {{ATTITUDE_QUATERNION: {2 * rate}, GPS_HEADING_STATUS: 5, ARRAY_STATUS: 5}}"
     link = f"{{name: meter, url: 'udpout://127.0.0.1:{meter.port}', {emit}}}"
-    with _process([*command, "run", "--set", f"links=[{link}]"], meter) as number:
+    told = [part for setting in (f"links=[{link}]", *settings) for part in ("--set", setting)]
+    with _process([*command, "run", *told], meter) as number:
         yield number
 
 

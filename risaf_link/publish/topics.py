@@ -67,7 +67,8 @@ class HeadingReport(Struct, frozen=True):
     innovation_rad: Annotated[Number, Meta(description="measured minus predicted")]
     innovation_std_rad: Annotated[Number, Meta(description="its standard deviation")]
     test_ratio: Annotated[
-        Number, Meta(description="|innovation| / (gate x deviation); rejected above 1")
+        Number,
+        Meta(description="size of the innovation / (gate x its deviation); rejected above 1"),
     ]
     speed_m_s: Annotated[Number, Meta(description="over ground, of the last fix")]
     since_fused_s: Annotated[Number, Meta(description="since the last heading that was fused")]
