@@ -7,6 +7,7 @@ of any kind is a ConnectionError that says what it was.
 import asyncio
 import contextlib
 import logging
+import re
 import socket
 import threading
 import traceback
@@ -201,7 +202,7 @@ def _reason(error: BaseException) -> str:
     """What went wrong, in a few words."""
     if isinstance(error, aiomqtt.MqttCodeError):
         return "connection lost" if _number(error.rc) in LOST else _words(error.rc)
-    text = str(error)
+    text = re.sub(r"^\[Errno -?\d+\] ", "", str(error))
     return NO_ANSWER if text == TIMED_OUT else text or type(error).__name__
 
 
