@@ -190,7 +190,8 @@ async def connected(broker: Broker, will: Message, version: int) -> AsyncIterato
         raise (NoAnswerError if reason == NO_ANSWER else ConnectionError)(reason) from None
     finally:
         if not entering.done():  # a thread cannot be interrupted
-            await client.thread_ended.wait()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(client.thread_ended.wait(), 2 * CONNECT_S)
             entering.cancel()
             await asyncio.wait([entering])
         if not entering.cancelled():
