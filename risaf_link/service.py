@@ -156,7 +156,7 @@ class Service:
     @property
     def dropped(self) -> Counter[str]:
         """Frames that were lost in parsing, by reason."""
-        return sum((parser.dropped for parser in self._parsers.values()), self._dropped)
+        return sum((parser.dropped for parser in self._parsers.values()), Counter(self._dropped))
 
     @property
     def rejected(self) -> Counter[str]:
