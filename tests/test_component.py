@@ -17,6 +17,7 @@ from wire import frame
 
 from risaf_link.config import Config
 from risaf_link.core.estimate import Estimate
+from risaf_link.core.guard import Refused
 from risaf_link.core.heading import HeadingState
 from risaf_link.core.health import SensorState
 from risaf_link.mavlink.dialect import IDS
@@ -475,6 +476,14 @@ class TestNotices:
         assert self.told(network, **brief) == []
         assert self.told(network, **long) == ["GPS heading rejected"]
         assert self.told(network, **on) == ["GPS heading is used again"]
+
+    @pytest.mark.parametrize(("innovation", "told"), [(0.6, ", test ratio 2.0"), (0.1, "")])
+    def test_a_rejection_tells_by_how_much_where_that_was_the_reason(
+        self, network, innovation, told
+    ):
+        refused = Refused(innovation, 0.01, 3.0)
+        status = self.status(HeadingState.REJECTING, time_since_fused=3.0, innovation=refused)
+        assert self.told(network, heading=status) == [f"GPS heading rejected{told}"]
 
     def test_sensors_that_die_and_come_back(self, network):
         health = ESTIMATE.array.health

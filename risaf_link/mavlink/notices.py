@@ -113,8 +113,12 @@ class Notices:
         innovation = estimate.heading.innovation
         if not self._rejecting:
             return Notice(Severity.INFO, "GPS heading is used again")
-        ratio = f", test ratio {innovation.test_ratio:.1f}" if innovation else ""
-        return Notice(Severity.WARNING, f"GPS heading rejected{ratio}")
+        if (
+            innovation is None or innovation.test_ratio <= 1.0
+        ):  # others or positions speak against it
+            return Notice(Severity.WARNING, "GPS heading rejected")
+        ratio = f"test ratio {innovation.test_ratio:.1f}"
+        return Notice(Severity.WARNING, f"GPS heading rejected, {ratio}")
 
     def _changed(self, matter: str, state: object, first: object, now_us: int) -> bool:
         told, when_us = self._told.get(matter, (first, -LEAST_PAUSE_US))
