@@ -8,10 +8,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from risaf_link.core.rotation import Floats
 from risaf_link.survey import MessageCount, Survey, paces, verdict
 
 MOST_GAPS = 20
-PARTS = 32  # of a log's time, in a line of a table
+PARTS, WIDE = 32, 500  # of a log's time, in a line of a table and of a picture
 BARS = " ▁▂▃▄▅▆▇█"
 FULL_BAR = 6  # that of the median rate: there is room above
 MOST_OUTAGES = 3  # in a line of a table
@@ -40,16 +41,21 @@ def summary_text(log: Path, summary: dict[str, Any]) -> str:
         )
     if not summary["outages"]:
         lines.append("no outage of GPS")
-    for outage in summary["outages"]:
-        line = f"without GPS from {outage['start_s']:.1f} to {outage['end_s']:.1f} s, against "
-        line += REFERENCES[outage["reference"]]
-        if outage["rmse_deg"] is not None:
-            line += (
-                f": {outage['rmse_deg']:.2f} deg RMS, {outage['final_deg']:.2f} deg at the end, "
-                f"{outage['max_deg']:.2f} deg at most, {outage['drift_deg_per_min']:.2f} deg/min"
-            )
-        lines.append(line)
+    lines += map(_outage_line, summary["outages"])
+    if summary["mismatch"]:
+        lines.append(f"no estimates from some epochs: {summary['mismatch']}")
     return "\n".join(lines)
+
+
+def _outage_line(outage: dict[str, Any]) -> str:
+    line = f"without GPS from {outage['start_s']:.1f} to {outage['end_s']:.1f} s, against "
+    line += REFERENCES[outage["reference"]]
+    if outage["rmse_deg"] is not None:
+        line += (
+            f": {outage['rmse_deg']:.2f} deg RMS, {outage['final_deg']:.2f} deg at the end, "
+            f"{outage['max_deg']:.2f} deg at most, {outage['drift_deg_per_min']:.2f} deg/min"
+        )
+    return line
 
 
 def fleet_text(rows: list[dict[str, Any]]) -> str:
@@ -161,6 +167,18 @@ def calibration_text(log: Path, found: dict[str, Any]) -> str:
         "of sampling time make",
     ]
     return "\n".join(lines)
+
+
+def pace_rows(found: Survey) -> list[tuple[str, Floats]]:
+    """Every message, and its rate over time, for a picture."""
+    return [
+        (
+            f"{name} {system}/{component} {message.rate:7.1f} Hz",
+            paces(message, found.duration, WIDE),
+        )
+        for (system, component, name), message in sorted(found.messages.items())
+        if message.history is not None
+    ]
 
 
 def _bars(message: MessageCount, duration: float) -> str:

@@ -153,7 +153,8 @@ class PaperFilter:
     @property
     def bias_std(self) -> Floats:
         """Standard deviation of the bias, (3,), rad/s."""
-        return np.sqrt(np.diag(self._covariance)[BIAS])
+        std: Floats = np.sqrt(np.diag(self._covariance)[BIAS])
+        return std
 
     def configure(self, parameters: AttitudeParameters) -> None:
         """Take new parameters; the state stays, and with it what they say of the start."""

@@ -48,12 +48,12 @@ class History:
     @property
     def edges(self) -> Floats:
         """Where the steps begin, and where the last one ends, (m + 1,), s."""
-        return self.step * np.arange(self._used + 1)
+        return self.step * np.arange(self._used + 1, dtype=float)
 
     @property
     def times(self) -> Floats:
         """Middles of the steps, (m,), s."""
-        return self.step * (np.arange(self._used) + 0.5)
+        return self.step * (np.arange(self._used, dtype=float) + 0.5)
 
     @property
     def values(self) -> Floats:

@@ -4,7 +4,7 @@ Estimates are gathered, and condensed many at once, by columns; the whole estima
 now and then.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,11 +109,15 @@ class Course:
         When no samples came, s from the first: begin and end.
     events : list of Event
         The first ones; `more_events` came after them.
+    nis : float
+        Mean of the innovations' squares over their variances, of the `fused` ones that were not
+        resets; 1 is as stated.
     duration : float
         s.
     began_us : int
         When the first epoch was received, us since 1970.
-    sensors_seen : int
+    aligned_s : float or None
+        When yaw was first known.
     """
 
     def __init__(self) -> None:
@@ -130,11 +134,13 @@ class Course:
         self.more_events = 0
         self.duration = 0.0
         self.began_us = 0
-        self.aligned_s: float | None = None  # when yaw was first known
+        self.aligned_s: float | None = None
         self._gathered: list[EstimateBlock] = []
         self._waiting = 0  # epochs in them
         self._looks, self._events = Looks(), Events()
         self._looked, self._lost = 0.0, 0  # at the last look: s, samples
+        self.nis = 0.0
+        self.fused = 0
         self._last: Innovation | None = None
         self._begun = False
 
@@ -158,7 +164,8 @@ class Course:
 
     def take_errors(self, errors: Errors) -> None:
         """Take heading errors."""
-        self.errors.setdefault(errors.reference, ErrorCourse()).add(errors)
+        if len(errors.error):
+            self.errors.setdefault(errors.reference, ErrorCourse()).add(errors)
 
     def finish(self) -> None:
         """Condense what is left at the end."""
@@ -199,6 +206,9 @@ class Course:
         fused, reset, ratio = innovation.fused, innovation.reset, innovation.test_ratio
         row = (elapsed, heading.heading, innovation.value, std, innovation.gate, fused, reset)
         self.innovations.add((*row, ratio))
+        if fused and not reset:
+            self.fused += 1
+            self.nis += (innovation.value**2 / innovation.variance - self.nis) / self.fused
 
     def _note_array(self, status: ArrayStatus, elapsed: float) -> None:
         health = status.health
@@ -218,5 +228,5 @@ class Course:
         self.more_events += max(0, len(events) - room)
 
 
-def _joined(parts: "Iterator[Floats]") -> Floats:
-    return np.concatenate(list(parts))
+def _joined(parts: Iterable[Floats | NDArray[np.int64]]) -> Floats:
+    return np.concatenate(list(parts)).astype(float)
