@@ -553,8 +553,9 @@ def _sinks(
         rows = RowWriter(files.enter_context(_open(options["csv"], "w")))
         sinks.append(rows.write)
     if options["mcap"]:
-        from risaf_link.publish.mcap import McapWriter
+        from risaf_link.publish.mcap import McapWriter, require
 
+        require()
         mcap = McapWriter(files.enter_context(_open(options["mcap"], "wb")), log.name)
         files.callback(mcap.finish)
         replayed.truth_listeners.append(mcap.take_truth)

@@ -19,7 +19,7 @@ MOST_NIS = 2.0  # mean of the innovations' squares over their variances; 1 is as
 MOST_REJECTED = 0.10  # of GPS headings
 UNSURE = 10.0  # deg that a stated deviation may reach
 SETTLING = 30.0  # s after the first heading for which it may be more
-MOST_NAMED = 12  # sensors in a sentence
+MOST_NAMED = 10  # sensors in one breath
 REASONS = {
     Reason.SETTLING: "settling",
     Reason.WANDERING: "wandering",
@@ -67,20 +67,16 @@ def heading_verdict(summary: dict[str, Any], course: Course) -> Verdict:
     if course.aligned_s is None:
         count = heading["fused"] + heading["rejected"]
         why = f"{count} GPS headings did not set it" if count else "no GPS heading came"
-        return Verdict(
-            "none",
-            "There is no heading.",
-            (f"Yaw was never known: {why}. Roll, pitch and rates are there.",),
-        )
-    sentences = [f"Yaw is known from {course.aligned_s:.1f} s on."]
+        said = f"Yaw was never known: {why}. Roll, pitch and rates are there."
+        return Verdict("none", "There is no heading.", (said, *_by_mismatch(summary)))
+    known = f"Yaw is known from {course.aligned_s:.1f} s on."
+    sentences: list[str] = []
     doubts: list[str] = []
     for judged in (_by_errors(summary, course), _by_innovations(heading, course)):
         sentences += judged[0]
         doubts += judged[1]
-    doubts += _by_deviation(course)
-    if summary["mismatch"]:
-        doubts.append(f"from some epochs there are no estimates: {summary['mismatch']}")
-    sentences += [f"{doubt[0].upper()}{doubt[1:]}." for doubt in doubts]
+    doubts += [*_by_deviation(course), *_by_mismatch(summary)]
+    sentences = [*doubts, known, *sentences]
     if doubts:
         return Verdict("care", "The heading is to be used with care.", tuple(sentences))
     return Verdict(
@@ -115,14 +111,20 @@ def sensor_sentences(course: Course) -> list[str]:
     suspect = len(rows) - len(ill)
     sentences = [f"{n - len(rows)} of {n} sensors were healthy throughout."]
     if ill:
-        named = ", ".join(
-            f"{row.sensor} ({row.reason}, {row.dead:.0f} s)" for row in ill[:MOST_NAMED]
-        )
-        more = f" and {len(ill) - MOST_NAMED} more" if len(ill) > MOST_NAMED else ""
-        sentences.append(f"{len(ill)} were dead for some time: {named}{more}.")
+        kinds = [
+            f"{_names([row.sensor for row in ill if row.reason == reason])} ({reason})"
+            for reason in dict.fromkeys(row.reason for row in ill)
+        ]
+        sentences.append(f"{len(ill)} were dead for some time: {'; '.join(kinds)}.")
     if suspect:
         sentences.append(f"{suspect} more were suspect for some time, and not used then.")
     return sentences
+
+
+def _names(sensors: list[int]) -> str:
+    more = len(sensors) - MOST_NAMED
+    named = ", ".join(map(str, sorted(sensors)[:MOST_NAMED]))
+    return f"{named} and {more} more" if more > 0 else named
 
 
 def _by_errors(summary: dict[str, Any], course: Course) -> tuple[list[str], list[str]]:
@@ -147,7 +149,7 @@ def _by_errors(summary: dict[str, Any], course: Course) -> tuple[list[str], list
             "Gaussian ones would be 68, 95 and 99.7 %."
         )
         if shares[1] < LEAST_WITHIN_TWO:
-            doubts.append(f"it is off by more than stated too often, against {of}")
+            doubts.append(f"It is off by more than stated too often, against {of}.")
     if not course.errors:
         sentences.append("The log has nothing to compare it with.")
     return sentences, doubts
@@ -159,14 +161,14 @@ def _by_innovations(heading: dict[str, int], course: Course) -> tuple[list[str],
     doubts = []
     if rejected > MOST_REJECTED * (fused + rejected):
         share = 100 * rejected / (fused + rejected)
-        doubts.append(f"{share:.0f} % of the GPS headings were rejected")
+        doubts.append(f"{share:.0f} % of the GPS headings were rejected.")
     if course.fused:
         sentences.append(
             f"Innovations, squared and over their variance, are {course.nis:.2f} on average; 1 is "
             "as stated."
         )
         if course.nis > MOST_NIS:
-            doubts.append("GPS headings differ from it by more than stated")
+            doubts.append("GPS headings differ from it by more than stated.")
     return sentences, doubts
 
 
@@ -174,4 +176,9 @@ def _by_deviation(course: Course) -> list[str]:
     settled = course.most.times > (course.aligned_s or 0.0) + SETTLING
     stated = np.degrees(course.most.values[settled, columns.YAW_STD])
     largest = float(np.nanmax(stated)) if np.isfinite(stated).any() else 0.0
-    return [f"its stated deviation grows to {largest:.0f} deg"] if largest > UNSURE else []
+    return [f"Its stated deviation grows to {largest:.0f} deg."] if largest > UNSURE else []
+
+
+def _by_mismatch(summary: dict[str, Any]) -> list[str]:
+    why = summary["mismatch"]
+    return [f"From some epochs there are no estimates: {why}."] if why else []

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"
 TEMPLATE = Path(__file__).parent / "publish" / PAGE
-FIRST_ROWS = 15  # of the sensors' table; the rest is folded away
 LATEST = datetime(9999, 12, 31, tzinfo=UTC).timestamp()
 
 
@@ -31,6 +30,7 @@ LATEST = datetime(9999, 12, 31, tzinfo=UTC).timestamp()
 class Picture:
     """One picture, as wide as a desk's screen and as a telephone's."""
 
+    name: str
     title: str
     wide: str  # URL
     narrow: str
@@ -164,7 +164,6 @@ def page(log: Path, config: Config, summary: dict[str, Any], course: Course, arr
 
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     environment.filters["number"] = _number
-    rows = sensor_rows(course)
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         log=log.name,
         array=array,
@@ -174,8 +173,7 @@ def page(log: Path, config: Config, summary: dict[str, Any], course: Course, arr
         verdict=heading_verdict(summary, course),
         references=REFERENCES,
         sensor_sentences=sensor_sentences(course),
-        sensors=rows[:FIRST_ROWS],
-        more_sensors=rows[FIRST_ROWS:],
+        sensors=sensor_rows(course),
         pictures=_pictures(course, shaded(summary)),
         configuration=dump(config),
         version=__version__,
@@ -197,7 +195,7 @@ def _pictures(course: Course, outages: list[tuple[float, float]]) -> list[Pictur
             draws: list[Callable[[], Figure]] = [getattr(album, name) for album in albums]
             sizes = plot.WIDE, plot.NARROW
             wide, narrow = (_url(draw(), size) for draw, size in zip(draws, sizes, strict=True))
-            pictures.append(Picture(title, wide, narrow, caption))
+            pictures.append(Picture(name, title, wide, narrow, caption))
     return pictures
 
 

@@ -111,17 +111,24 @@ class History:
 class Worst:
     """Of many moments the worst ones, in the order of time.
 
-    Whenever there are twice `ROOM` of them, of every two the worse one stays.
+    Each row is the worst of as many moments that follow one another. When there are twice `ROOM`
+    rows, of every two the worse one stays.
 
     Parameters
     ----------
     columns : int
         Of the row that says what a moment was; the last is how bad it was.
+
+    Attributes
+    ----------
+    seen : int
+        How many moments there were.
     """
 
     def __init__(self, columns: int) -> None:
         self._rows = np.empty((2 * ROOM, columns))
         self._used = 0
+        self._each = 1  # moments that a row is the worst of
         self.seen = 0
 
     @property
@@ -131,10 +138,16 @@ class Worst:
 
     def add(self, row: tuple[float, ...]) -> None:
         """Take the next moment."""
-        if self._used == len(self._rows):
-            pairs = self._rows.reshape(ROOM, 2, -1)
-            self._rows[:ROOM] = pairs[np.arange(ROOM), pairs[:, :, -1].argmax(axis=1)]
-            self._used = ROOM
-        self._rows[self._used] = row
-        self._used += 1
         self.seen += 1
+        if self.seen > self._used * self._each:
+            if self._used == len(self._rows):
+                self._fold()
+            self._rows[self._used] = row
+            self._used += 1
+        elif row[-1] > self._rows[self._used - 1, -1]:
+            self._rows[self._used - 1] = row
+
+    def _fold(self) -> None:
+        pairs = self._rows.reshape(ROOM, 2, -1)
+        self._rows[:ROOM] = pairs[np.arange(ROOM), pairs[:, :, -1].argmax(axis=1)]
+        self._used, self._each = ROOM, 2 * self._each

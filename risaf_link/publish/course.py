@@ -216,8 +216,10 @@ class Course:
         self.health.widen(len(health.state))
         worst = np.full((1, self.health.columns), np.nan)
         worst[0, : len(health.state)] = 8.0 * health.state + health.reason
-        at = np.arange(self._looked, elapsed, self.health.step)  # the state of the time since then
-        self.health.add(np.append(at[1:], elapsed), np.repeat(worst, max(len(at), 1), axis=0))
+        self.health.add(np.array([elapsed]), worst)
+        steps = np.arange(int(self._looked / self.health.step), len(self.health))
+        since = (steps + 0.5) * self.health.step  # the state is that of all the time since then
+        self.health.add(since, np.repeat(worst, len(since), axis=0))
         lost = np.array([[float(status.samples_lost - self._lost)]])
         self.lost.add(np.array([elapsed]), lost)
         self._looked, self._lost = elapsed, status.samples_lost

@@ -8,6 +8,7 @@ left out.
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from typing import Any, BinaryIO
 
 import msgspec
@@ -194,6 +195,18 @@ SCHEMAS: dict[str, tuple[str, Schema]] = {
 """Topic: name and JSON schema of its messages."""
 
 
+def require() -> None:
+    """Make sure that MCAP can be written.
+
+    Raises
+    ------
+    RisafError
+        Without the package mcap.
+    """
+    if not find_spec("mcap"):
+        raise RisafError("--mcap needs the package mcap: install risaf-link with the extra `mcap`")
+
+
 class McapWriter:
     """Writes the estimates of one run.
 
@@ -211,12 +224,9 @@ class McapWriter:
     """
 
     def __init__(self, file: BinaryIO, log: str) -> None:
-        try:
-            from mcap.writer import CompressionType, Writer
-        except ImportError:
-            raise RisafError(
-                "--mcap needs the package mcap: install risaf-link with the extra `mcap`"
-            ) from None
+        require()
+        from mcap.writer import CompressionType, Writer
+
         self._writer = Writer(file, compression=CompressionType.ZSTD)
         self._writer.start(library=f"risaf-link {__version__}")
         self._writer.add_metadata("risaf_link", {"log": log, "version": __version__})
@@ -245,7 +255,8 @@ class McapWriter:
     def take_truth(self, truths: Truths) -> None:
         """Write true attitudes."""
         angles = np.degrees(eulers_of(truths.q_nb)).T
-        times_us = truths.time_us.astype(np.int64) if truths.by_boot else np.zeros(len(angles), int)
+        sent_us = np.minimum(truths.time_us, LATEST_NS // 1000).astype(np.int64)
+        times_us = sent_us if truths.by_boot else np.zeros_like(sent_us)
         rows = _rows((*QUATERNION, *IN_DEGREES), np.hstack((truths.q_nb, angles)))
         received_us = truths.received_us.tolist()
         for time_us, came_us, row in zip(times_us.tolist(), received_us, rows, strict=True):

@@ -106,7 +106,9 @@ class Size:
             top -= above + height
             across = (self.width - self.left - self.right) / self.width
             place = (self.left / self.width, top / total, across, height / total)
-            panels.append(made.add_axes(place, sharex=panels[0] if panels else None))
+            panel = made.add_axes(place, sharex=panels[0] if panels else None)
+            panel.yaxis.set_label_coords(-(self.left - 0.2) / (across * self.width), 0.5)
+            panels.append(panel)
         for panel in panels[:-1]:
             panel.tick_params(labelbottom=False)
         panels[-1].set_xlabel("time since the first sample (s)")
@@ -116,7 +118,7 @@ class Size:
 
 
 WIDE = Size(width=10.0, dpi=144, left=0.75, legend=6)
-NARROW = Size(width=4.6, dpi=200, left=0.62, legend=3, lines=2, scale=0.9)
+NARROW = Size(width=4.6, dpi=200, left=0.72, legend=3, lines=2, scale=0.9)
 
 
 def require() -> None:
