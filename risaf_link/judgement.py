@@ -108,16 +108,16 @@ def sensor_sentences(course: Course) -> list[str]:
     rows = sensor_rows(course)
     n = len(course.standing.dead)
     ill = [row for row in rows if row.dead]
-    suspect = len(rows) - len(ill)
-    sentences = [f"{n - len(rows)} of {n} sensors were healthy throughout."]
+    suspect = [row.sensor for row in rows if not row.dead]
+    sentences = [f"Healthy throughout: {n - len(rows)} of {n}."]
     if ill:
         kinds = [
             f"{_names([row.sensor for row in ill if row.reason == reason])} ({reason})"
             for reason in dict.fromkeys(row.reason for row in ill)
         ]
-        sentences.append(f"{len(ill)} were dead for some time: {'; '.join(kinds)}.")
+        sentences.append(f"Dead for some time: {'; '.join(kinds)}.")
     if suspect:
-        sentences.append(f"{suspect} more were suspect for some time, and not used then.")
+        sentences.append(f"Suspect for some time, and not used meanwhile: {_names(suspect)}.")
     return sentences
 
 

@@ -269,9 +269,7 @@ def test_a_sensor_that_falls_silent_is_named_with_its_time(tmp_path):
     assert course.health.values[-1, 5] == 8 * SensorState.DEAD + Reason.SILENT
     assert (course.health.values[:, :5] == 0).all()  # no moment is left out
     shown = Page(page(log, Config(), replay.summary(), course, replay.array_name))
-    assert "7 of 8 sensors were healthy throughout. 1 were dead for some time: 5 (silent)." in (
-        shown.text
-    )
+    assert "Healthy throughout: 7 of 8. Dead for some time: 5 (silent)." in shown.text
 
 
 def test_a_gap_in_the_samples_is_told_and_shaded(tmp_path):

@@ -138,7 +138,9 @@ class Course:
         self._gathered: list[EstimateBlock] = []
         self._waiting = 0  # epochs in them
         self._looks, self._events = Looks(), Events()
+        self._seen: list[tuple[float, int, Floats, Floats]] = []  # looks: s, samples, rad/s, codes
         self._looked, self._lost = 0.0, 0  # at the last look: s, samples
+        self._condensed = 0.0  # s, at the last one that is condensed
         self.nis = 0.0
         self.fused = 0
         self._last: Innovation | None = None
@@ -156,8 +158,7 @@ class Course:
             self._note_innovation(float(block.elapsed[0]), heading, innovation)
         looked = self._looks.estimate if self._looks.look(block) else None
         if looked is not None:
-            self._note_array(looked.array, looked.elapsed)
-            self.bias_std.add(block.elapsed[-1:], block.bias_std()[np.newaxis])
+            self._note_array(looked.array, looked.elapsed, block.bias_std())
         self._note_events(self._events.take(block, looked))
         if self._waiting >= GATHERED:
             self._condense()
@@ -172,6 +173,7 @@ class Course:
         self._condense()
 
     def _condense(self) -> None:
+        self._condense_looks()
         blocks, self._gathered, self._waiting = self._gathered, [], 0
         if not blocks:
             return
@@ -210,19 +212,32 @@ class Course:
             self.fused += 1
             self.nis += (innovation.value**2 / innovation.variance - self.nis) / self.fused
 
-    def _note_array(self, status: ArrayStatus, elapsed: float) -> None:
-        health = status.health
+    def _note_array(self, status: ArrayStatus, elapsed: float, bias_std: Floats) -> None:
         self.standing.add(status, self._looked, elapsed)
-        self.health.widen(len(health.state))
-        worst = np.full((1, self.health.columns), np.nan)
-        worst[0, : len(health.state)] = 8.0 * health.state + health.reason
-        self.health.add(np.array([elapsed]), worst)
-        steps = np.arange(int(self._looked / self.health.step), len(self.health))
-        since = (steps + 0.5) * self.health.step  # the state is that of all the time since then
-        self.health.add(since, np.repeat(worst, len(since), axis=0))
-        lost = np.array([[float(status.samples_lost - self._lost)]])
-        self.lost.add(np.array([elapsed]), lost)
+        codes: Floats = (8 * status.health.state + status.health.reason).astype(float)
+        self._seen.append((elapsed, status.samples_lost - self._lost, bias_std, codes))
         self._looked, self._lost = elapsed, status.samples_lost
+
+    def _condense_looks(self) -> None:
+        looks, self._seen = self._seen, []
+        if not looks:
+            return
+        elapsed = np.array([look[0] for look in looks])
+        begin = np.append(self._condensed, elapsed[:-1])
+        self._condensed = float(elapsed[-1])
+        self.lost.add(elapsed, np.array([[float(look[1])] for look in looks]))
+        self.bias_std.add(elapsed, np.array([look[2] for look in looks]))
+        self.health.widen(max(len(look[3]) for look in looks))
+        codes = np.full((len(looks), self.health.columns), np.nan)
+        for row, look in zip(codes, looks, strict=True):
+            row[: len(look[3])] = look[3]
+        self.health.add(elapsed, codes)
+        step = self.health.step  # how a sensor stands is how it stood since the look before
+        first, last = (begin / step).astype(np.int64), (elapsed / step).astype(np.int64)
+        spans = last - first + 1
+        rows = np.repeat(np.arange(len(looks)), spans)
+        within = np.arange(len(rows)) - (np.cumsum(spans) - spans)[rows]
+        self.health.add((first[rows] + within + 0.5) * step, codes[rows])
 
     def _note_events(self, events: list[Event]) -> None:
         room = MOST_EVENTS - len(self.events)

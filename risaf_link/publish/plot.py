@@ -220,7 +220,7 @@ class Album:
 
     def biases(self) -> "Figure":
         """Biases of the fused rate, axis by axis."""
-        figure, panels = self._size.figure((0.95, 0.95, 0.95))
+        figure, panels = self._size.figure((0.95, 0.95, 0.95), lines=1)
         least, most = self._course.least, self._course.most
         std = self._course.bias_std
         for axis, panel in enumerate(panels):
@@ -245,7 +245,7 @@ class Album:
 
     def rates(self) -> "Figure":
         """Rates of the vehicle, axis by axis."""
-        figure, panels = self._size.figure((0.8, 0.8, 0.8))
+        figure, panels = self._size.figure((0.8, 0.8, 0.8), lines=1)
         for axis, panel in enumerate(panels):
             self._draw_range(panel, columns.RATE.start + axis, BLUE, "rate, bias taken off")
             panel.set_ylabel(f"{'xyz'[axis]} (deg/s)")
@@ -253,7 +253,7 @@ class Album:
 
     def tilt(self) -> "Figure":
         """Roll and pitch with what is stated of them."""
-        figure, panels = self._size.figure((1.0, 1.0))
+        figure, panels = self._size.figure((1.0, 1.0), lines=1)
         least, most = self._course.least, self._course.most
         names = (("roll", columns.ROLL), ("pitch", columns.PITCH))
         for i, (panel, (name, column)) in enumerate(zip(panels, names, strict=True)):
@@ -319,7 +319,8 @@ class Album:
         """Epochs a second, samples lost, sensors behind the fused rate."""
         course = self._course
         has_lost = bool(course.lost.values.any())
-        figure, panels = self._size.figure((1.0, *([0.8] if has_lost else []), 1.0))
+        heights = (1.0, *([0.8] if has_lost else []), 1.0)
+        figure, panels = self._size.figure(heights, lines=1)
         time_s, rate = _rates(course.epochs, course.duration)
         panels[0].plot(time_s, rate, drawstyle="steps-mid", color=BLUE, label="epochs")
         panels[0].set(ylabel="epochs/s", ylim=(0.0, 1.15 * max(float(rate.max()), 1e-3)))
