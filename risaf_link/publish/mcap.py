@@ -1,8 +1,8 @@
 """Estimates as MCAP, with JSON messages and their schemas, for Foxglove, PlotJuggler and others.
 
 The logged time of a message is when it was received, its published time that of the vehicle's boot
-clock. Every message of ours has `time_us`, the time as samples were stamped. What is not known is
-left out.
+clock at which samples were taken. Every message of ours has `time_us`, the time as samples were
+stamped. What is not known is left out.
 """
 
 import math

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-BLUE, SKY, GREEN, ORANGE = "#0072B2", "#56B4E9", "#009E73", "#E69F00"
-VERMILLION, PURPLE, YELLOW, INK, GREY = "#D55E00", "#CC79A7", "#F0E442", "#222222", "#8A8A8A"
+BLUE, SKY, ORANGE, VERMILLION, YELLOW = "#0072B2", "#56B4E9", "#E69F00", "#D55E00", "#F0E442"
+INK, GREY = "#222222", "#8A8A8A"
 
 MARKERS: dict[Reference, str] = {"truth": "truth", "gps": "withheld GPS"}
 RATE_EPOCHS = 20  # in a step of the epoch rate, at least: with fewer it flickers
@@ -60,15 +60,15 @@ HEALTHY_COLOUR = "#ECECEC"
 STANDINGS: dict[tuple[SensorState, Reason], tuple[str, str]] = {
     (SensorState.SUSPECT, Reason.SETTLING): ("suspect: settling", "#BFE0F5"),
     (SensorState.SUSPECT, Reason.WANDERING): ("suspect: wandering", YELLOW),
-    (SensorState.SUSPECT, Reason.OUTLYING): ("suspect: outlying", ORANGE),
+    (SensorState.SUSPECT, Reason.OUTLYING): ("suspect: outlying", "#F4A582"),
     (SensorState.SUSPECT, Reason.SILENT): ("suspect: silent", "#9A9A9A"),
     (SensorState.DEAD, Reason.SETTLING): ("dead: not trusted for a minute", BLUE),
-    (SensorState.DEAD, Reason.WANDERING): ("dead: wandering", GREEN),
-    (SensorState.DEAD, Reason.OUTLYING): ("dead: outlying", "#A63A00"),
+    (SensorState.DEAD, Reason.WANDERING): ("dead: wandering", "#A39600"),
+    (SensorState.DEAD, Reason.OUTLYING): ("dead: outlying", "#8C2D04"),
     (SensorState.DEAD, Reason.FROZEN): ("dead: frozen", "#7A3E8E"),
     (SensorState.DEAD, Reason.SILENT): ("dead: silent", "#000000"),
 }
-"""How a sensor stood, in words and as a colour: the worse the darker."""
+"""How a sensor stood, in words and as a colour: one for each reason, darker where it is dead."""
 
 PACES = (
     *(("none", 0.0, "#FFFFFF"), ("below half", 0.5, VERMILLION), ("50 to 80 %", 0.8, ORANGE)),
