@@ -10,6 +10,7 @@ import numpy as np
 
 from risaf_link.core.health import Reason
 from risaf_link.core.outage import Reference
+from risaf_link.core.rotation import Floats
 from risaf_link.publish import course as columns
 from risaf_link.publish.course import Course
 from risaf_link.words import REFERENCES
@@ -49,7 +50,7 @@ class SensorRow:
     dead: float  # s
     first: float  # s from the first sample: when it began
     last: float  # s: when it ended
-    reason: str  # for most of the time
+    reason: str  # for most of the time, settling apart
     rejected: float  # largest share of its readings
 
 
@@ -95,7 +96,7 @@ def sensor_rows(course: Course) -> list[SensorRow]:
             float(s.dead[i]),
             float(s.first[i]),
             float(s.last[i]),
-            REASONS[Reason(1 + int(s.reasons[i, 1:].argmax()))],
+            REASONS[_main_reason(s.reasons[i])],
             float(s.rejected[i]),
         )
         for i in order.tolist()
@@ -121,6 +122,12 @@ def sensor_sentences(course: Course) -> list[str]:
     return sentences
 
 
+def _main_reason(seconds: Floats) -> Reason:
+    """Why a sensor was not healthy for most of the time; what it had to settle after, if any."""
+    causes = seconds[Reason.WANDERING :]
+    return Reason(Reason.WANDERING + int(causes.argmax())) if causes.any() else Reason.SETTLING
+
+
 def _names(sensors: list[int]) -> str:
     more = len(sensors) - MOST_NAMED
     named = ", ".join(map(str, sorted(sensors)[:MOST_NAMED]))
@@ -142,14 +149,15 @@ def _by_errors(summary: dict[str, Any], course: Course) -> tuple[list[str], list
         if found is None:
             continue
         shares = found.within / found.count
-        of = REFERENCES[reference]
+        against_truth = reference == "truth"
+        usual = "Gaussian ones would be 68, 95 and 99.7 %" if against_truth else "GPS errs as well"
         sentences.append(
-            f"Of the errors against {of}, {100 * shares[0]:.0f} % lie within one deviation as "
-            f"stated, {100 * shares[1]:.0f} % within two, {100 * shares[2]:.0f} % within three; "
-            "Gaussian ones would be 68, 95 and 99.7 %."
+            f"Of the errors against {REFERENCES[reference]}, {100 * shares[0]:.0f} % lie within "
+            f"one deviation as stated, {100 * shares[1]:.0f} % within two, "
+            f"{100 * shares[2]:.0f} % within three; {usual}."
         )
-        if shares[1] < LEAST_WITHIN_TWO:
-            doubts.append(f"It is off by more than stated too often, against {of}.")
+        if against_truth and shares[1] < LEAST_WITHIN_TWO:
+            doubts.append("It is off by more than stated too often, against truth.")
     if not course.errors:
         sentences.append("The log has nothing to compare it with.")
     return sentences, doubts

@@ -308,6 +308,25 @@ def test_a_heading_that_is_off_by_more_than_stated_is_to_be_used_with_care(drive
     assert doubtful.sentences[0] == "It is off by more than stated too often, against truth."
 
 
+def test_withheld_gps_is_no_judge_of_what_the_heading_states(drive):
+    replay, course = followed(drive, Selection(outages=((8.0, 14.0),)))
+    course.errors["gps"].within[:] = 0
+    verdict = heading_verdict(replay.summary(), course)
+    assert verdict.trust == "good"
+    assert any("0 % within three; GPS errs as well." in said for said in verdict.sentences)
+
+
+def test_many_rejected_headings_are_told_first(drive):
+    replay, course = followed(drive)
+    summary = replay.summary()
+    summary["heading"] = {"fused": 80, "rejected": 20}
+    verdict = heading_verdict(summary, course)
+    assert (verdict.trust, verdict.sentences[0]) == (
+        "care",
+        "20 % of the GPS headings were rejected.",
+    )
+
+
 def test_the_share_of_errors_within_what_is_stated_is_counted(drive):
     replay, course = Replay(Config(), drive, Selection()), Course()
     ratios = []
