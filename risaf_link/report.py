@@ -14,6 +14,7 @@ from risaf_link.config import Config, dump
 from risaf_link.errors import ConfigError, RisafError
 from risaf_link.judgement import heading_verdict, sensor_rows, sensor_sentences
 from risaf_link.publish import plot
+from risaf_link.publish.album import Album
 from risaf_link.publish.course import Course
 from risaf_link.replay import Replay
 from risaf_link.words import REFERENCES
@@ -127,7 +128,7 @@ class LookBack:
         summary = self._replayed.summary()
         if self._picture:
             with plot.styled():
-                figure = plot.Album(self._course, shaded(summary)).overview(self._log.name)
+                figure = Album(self._course, shaded(summary)).overview(self._log.name)
                 plot.save(figure, self._picture, plot.WIDE)
         if self._directory:
             made = page(self._log, self._config, summary, self._course, self._replayed.array_name)
@@ -186,7 +187,7 @@ def shaded(summary: dict[str, Any]) -> list[tuple[float, float]]:
 
 
 def _pictures(course: Course, outages: list[tuple[float, float]]) -> list[Picture]:
-    albums = [plot.Album(course, outages, size) for size in (plot.WIDE, plot.NARROW)]
+    albums = [Album(course, outages, size) for size in (plot.WIDE, plot.NARROW)]
     pictures = []
     with plot.styled():
         for name, (title, caption) in CAPTIONS.items():

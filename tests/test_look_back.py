@@ -25,8 +25,9 @@ from risaf_link.mavlink.dialect import name_of
 from risaf_link.mavlink.frame import Frame, FrameParser, encode
 from risaf_link.mavlink.tlog import TlogReader, record
 from risaf_link.publish import plot
+from risaf_link.publish.album import Album
 from risaf_link.publish.course import Course
-from risaf_link.publish.mcap import SCHEMAS
+from risaf_link.publish.mcap_schemas import SCHEMAS
 from risaf_link.replay import Replay, Selection
 from risaf_link.report import page, shaded
 
@@ -174,7 +175,7 @@ def test_every_picture_is_shaded_where_the_json_has_an_outage(drive, name):
     outages = shaded(replay.summary())
     assert outages == [(6.0, 8.0), (11.0, 14.0)]
     with plot.styled():
-        figure = getattr(plot.Album(course, outages), name)()
+        figure = getattr(Album(course, outages), name)()
     for axes in figure.axes:
         assert spans(axes, plot.ORANGE) == outages
 
@@ -282,7 +283,7 @@ def test_a_gap_in_the_samples_is_told_and_shaded(tmp_path):
     assert [event.text for event in course.events] == ["no samples for 3.0 s"]
     with plot.styled():
         for name in PICTURES[:2]:
-            (axes,) = getattr(plot.Album(course, []), name)().axes
+            (axes,) = getattr(Album(course, []), name)().axes
             assert spans(axes, "#BDBDBD") == [gap]
     assert (
         "No samples from 4.0 to 7.0 s."
