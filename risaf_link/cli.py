@@ -16,8 +16,8 @@ from risaf_link.errors import ConfigError, LinkError, LogError, RisafError
 if TYPE_CHECKING:  # what a command needs is imported when it runs: help must come at once
     from risaf_link.config import Config
     from risaf_link.core.estimate import EstimateBlock
-    from risaf_link.publish.plot import HeadingPlot
     from risaf_link.replay import Replay, Selection
+    from risaf_link.report import LookBack
 
 GROUPS = ("limits", "epoch", "replay", "log", "live", "start")  # of `bench`
 
@@ -196,6 +196,18 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
     help="Draw heading and error of one log (needs the extra `plot`).",
 )
 @click.option(
+    "--report",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Write report.html on one log: words, tables, pictures (needs the extra `plot`).",
+)
+@click.option(
+    "--mcap",
+    type=click.Path(path_type=Path),
+    metavar="OUT.mcap",
+    help="Write one log's estimates for Foxglove or PlotJuggler (needs the extra `mcap`).",
+)
+@click.option(
     "--json",
     "as_json",
     is_flag=True,
@@ -219,6 +231,7 @@ def replay(
     \b
     risaf-link replay drive.tlog --out estimate.tlog --csv estimate.csv
     risaf-link replay drive.tlog --outage 100:300 --set fusion.method=mean --json
+    risaf-link replay drive.tlog --report drive --mcap drive.mcap
     risaf-link replay night/*/*.tlog --csv tables --cluster tcp://10.0.0.1:8786
     """
     from risaf_link.kept import chosen_by, load_in_force
@@ -288,18 +301,33 @@ def simulate(
 @main.command()
 @click.argument("log", type=click.Path(path_type=Path))
 @_configured
-def inspect(log: Path, config_path: Path | None, settings: tuple[str, ...]) -> None:
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="OUT.png",
+    help="Draw how often each message came over time (needs the extra `plot`).",
+)
+def inspect(
+    log: Path, config_path: Path | None, settings: tuple[str, ...], plot: Path | None
+) -> None:
     """Tell what is in a log, and what the service could do with it.
 
     \b
     risaf-link inspect drive.tlog
+    risaf-link inspect drive.tlog --plot rates.png
     """
     from risaf_link.config import load
     from risaf_link.survey import survey
-    from risaf_link.words import survey_text
+    from risaf_link.words import pace_rows, survey_text
 
+    if plot:
+        from risaf_link.publish.plot import draw_paces, require
+
+        require()
     with _progress(log) as progress:
         found = survey(load(config_path, settings), log, progress)
+    if plot:
+        draw_paces(plot, log.name, pace_rows(found), found.duration)
     click.echo(survey_text(log, found))
 
 
@@ -471,16 +499,17 @@ def _replay_one(
     from risaf_link.replay import Replay
     from risaf_link.words import summary_text
 
-    replayed = Replay(config, log, selection, keep_trace=bool(options["plot"]))
-    plot = _plot(options["plot"])
+    replayed = Replay(config, log, selection)
+    looking = _look_back(log, config, replayed, options)
     with ExitStack() as files, _progress(log) as progress:
-        sinks = [*_sinks(config, replayed, options, files), *([plot.take] if plot else [])]
+        sinks = _sinks(log, config, replayed, options, files)
+        sinks += [looking.take] if looking else []
         singly = bool(options["out"] or options["speed"])
         for block in replayed.blocks(progress, singly):
             for sink in sinks:
                 sink(block)
-    if plot:
-        plot.draw(options["plot"], log.name, replayed.scorer.trace)
+    if looking:
+        looking.finish()
     summary = replayed.summary()
     click.echo(json.dumps(summary) if options["as_json"] else summary_text(log, summary))
 
@@ -491,7 +520,7 @@ def _replay_all(
     from risaf_link.fleet import replay_all
     from risaf_link.words import fleet_text
 
-    for name in ("speed", "out", "plot"):
+    for name in ("speed", "out", "plot", "report", "mcap"):
         if options[name] is not None:
             raise ConfigError(f"--{name}: only for one log, without --workers and --cluster")
     spread = options["csv"], options["workers"], options["cluster"]
@@ -510,7 +539,7 @@ def _open(path: Path, mode: str) -> Any:
 
 
 def _sinks(
-    config: "Config", replayed: "Replay", options: dict[str, Any], files: ExitStack
+    log: Path, config: "Config", replayed: "Replay", options: dict[str, Any], files: ExitStack
 ) -> list[Sink]:
     """What is to be done with the estimates."""
     from risaf_link.publish.rows import RowWriter
@@ -521,11 +550,20 @@ def _sinks(
         sinks.append(_pace(options["speed"]))
     if options["out"]:
         file = files.enter_context(_open(options["out"], "wb"))
-        log = OutputLog(config, file, replayed.identity)
-        sinks.append(log.write)
+        out = OutputLog(config, file, replayed.identity)
+        sinks.append(out.write)
     if options["csv"]:
         rows = RowWriter(files.enter_context(_open(options["csv"], "w")))
         sinks.append(rows.write)
+    if options["mcap"]:
+        from risaf_link.publish.mcap import McapWriter, require
+
+        require()
+        mcap = McapWriter(files.enter_context(_open(options["mcap"], "wb")), log.name)
+        files.callback(mcap.finish)
+        replayed.truth_listeners.append(mcap.take_truth)
+        replayed.scorer.listeners.append(mcap.take_errors)
+        sinks.append(mcap.take)
     return sinks
 
 
@@ -541,12 +579,15 @@ def _pace(speed: float) -> Sink:
     return wait
 
 
-def _plot(path: Path | None) -> "HeadingPlot | None":
-    if path is None:
+def _look_back(
+    log: Path, config: "Config", replayed: "Replay", options: dict[str, Any]
+) -> "LookBack | None":
+    """What is to be drawn when the log has ended."""
+    if not (options["plot"] or options["report"]):
         return None
-    from risaf_link.publish.plot import HeadingPlot
+    from risaf_link.report import LookBack
 
-    return HeadingPlot()
+    return LookBack(log, config, replayed, options["plot"], options["report"])
 
 
 @contextmanager

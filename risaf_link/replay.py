@@ -14,6 +14,7 @@ from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.heading import GpsFix
 from risaf_link.core.outage import Outage, Scorer, in_degrees
+from risaf_link.core.rotation import yaws_of
 from risaf_link.errors import ConfigError, LogError
 from risaf_link.links.file import read
 from risaf_link.mavlink.block import BlockReader
@@ -26,7 +27,7 @@ from risaf_link.mavlink.ingest import Ingest
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.telemetry import ComponentState, Emitter
 from risaf_link.mavlink.tlog import SENT, Stamps, TlogReader, record
-from risaf_link.mavlink.truth import truths_in
+from risaf_link.mavlink.truth import Truths, truths_in
 from risaf_link.pipeline import Pipeline
 
 LOG: Peer = ("log", "")
@@ -83,14 +84,14 @@ class Replay:
     path : Path
         A tlog.
     selection : Selection
-    keep_trace : bool
-        Keep every heading error, for a plot.
 
     Attributes
     ----------
     identity : Identity
         Whom the service would have been.
     scorer : Scorer
+    truth_listeners : list of callable
+        Called with the true attitudes that the log states.
 
     Raises
     ------
@@ -100,9 +101,7 @@ class Replay:
         If the log cannot be read.
     """
 
-    def __init__(
-        self, config: Config, path: Path, selection: Selection, keep_trace: bool = False
-    ) -> None:
+    def __init__(self, config: Config, path: Path, selection: Selection) -> None:
         self._path = path
         self._selection = selection
         self._pipeline = Pipeline(config, config.own, load_calibration(config))
@@ -112,11 +111,13 @@ class Replay:
         self._gps = Ingest(config.array, config.gps, config.own)
         self._gps_ids = {IDS[name] for name in config.gps.messages}
         outages = [Outage(*outage) for outage in selection.outages]
-        self.scorer = Scorer(config.heading, outages, keep_trace)
+        self.scorer = Scorer(config.heading, outages)
+        self.truth_listeners: list[Callable[[Truths], None]] = []
         self._reader: TlogReader | None = None
         self._frames = 0
         self._last: EstimateBlock | None = None
         self._seconds = 0.0
+        self._mismatch = ""  # why there were no estimates from some epochs
 
     def blocks(
         self, progress: Callable[[int], None] = lambda _: None, singly: bool = False
@@ -146,9 +147,12 @@ class Replay:
         for table, times_us in self._tables(progress):
             received_us = int(times_us[-1])
             for truth in truths_in(table, times_us):
-                self.scorer.take_truth(*truth)
+                self.scorer.take_truth(truth.time_us, yaws_of(truth.q_nb), truth.by_boot)
+                for listener in self.truth_listeners:
+                    listener(truth)
             for item in _singly(table, times_us) if singly else reader.read(table, times_us):
                 yield from self._take(item)
+                self._mismatch = self._pipeline.mismatch or self._mismatch
                 if singly:
                     yield from self._noted(self._pipeline.release())
         yield from self._noted(self._pipeline.flush(received_us))
@@ -176,6 +180,7 @@ class Replay:
                 "fused": last.heading.fused_count if last else 0,
                 "rejected": last.heading.rejected_count if last else 0,
             },
+            "mismatch": self._mismatch,
             "truth": in_degrees(self.scorer.truth.score()),
             "outages": [row for outage in self.scorer.outages for row in outage.rows()],
             "unused": {
@@ -184,6 +189,13 @@ class Replay:
                 if reason not in {"epochs", "incomplete", "samples_lost"}
             },
         }
+
+    @property
+    def array_name(self) -> str:
+        """What the array calls itself; empty: nothing."""
+        source = self._pipeline.assembler.source
+        info = self._pipeline.ingest.info(source) if source else None
+        return info.name if info else ""
 
     def _tables(self, progress: Callable[[int], None]) -> Iterator[tuple[FrameTable, Stamps]]:
         """Frames and times of what was selected."""
@@ -252,8 +264,8 @@ class Replay:
     def _require_estimates(self) -> None:
         if self._last is not None:
             return
-        if self._pipeline.mismatch:
-            raise ConfigError(f"array.calibration: {self._pipeline.mismatch}")
+        if self._mismatch:
+            raise ConfigError(f"array.calibration: {self._mismatch}")
         if not self._frames:
             raise LogError(f"{self._path}: found no MAVLink frame, expected a tlog")
         raise LogError(

@@ -4,12 +4,17 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from risaf_link.survey import Survey, verdict
+from risaf_link.core.rotation import Floats
+from risaf_link.survey import MessageCount, Survey, paces, verdict
 
 MOST_GAPS = 20
+PARTS, WIDE = 32, 500  # of a log's time, in a line of a table and of a picture
+BARS = " ▁▂▃▄▅▆▇█"
+FULL_BAR = 6  # that of the median rate: there is room above
 MOST_OUTAGES = 3  # in a line of a table
 MARKS = {"truth": "", "gps": " (GPS)"}
 FLEET = (
@@ -36,16 +41,21 @@ def summary_text(log: Path, summary: dict[str, Any]) -> str:
         )
     if not summary["outages"]:
         lines.append("no outage of GPS")
-    for outage in summary["outages"]:
-        line = f"without GPS from {outage['start_s']:.1f} to {outage['end_s']:.1f} s, against "
-        line += REFERENCES[outage["reference"]]
-        if outage["rmse_deg"] is not None:
-            line += (
-                f": {outage['rmse_deg']:.2f} deg RMS, {outage['final_deg']:.2f} deg at the end, "
-                f"{outage['max_deg']:.2f} deg at most, {outage['drift_deg_per_min']:.2f} deg/min"
-            )
-        lines.append(line)
+    lines += map(_outage_line, summary["outages"])
+    if summary["mismatch"]:
+        lines.append(f"no estimates from some epochs: {summary['mismatch']}")
     return "\n".join(lines)
+
+
+def _outage_line(outage: dict[str, Any]) -> str:
+    line = f"without GPS from {outage['start_s']:.1f} to {outage['end_s']:.1f} s, against "
+    line += REFERENCES[outage["reference"]]
+    if outage["rmse_deg"] is not None:
+        line += (
+            f": {outage['rmse_deg']:.2f} deg RMS, {outage['final_deg']:.2f} deg at the end, "
+            f"{outage['max_deg']:.2f} deg at most, {outage['drift_deg_per_min']:.2f} deg/min"
+        )
+    return line
 
 
 def fleet_text(rows: list[dict[str, Any]]) -> str:
@@ -97,12 +107,14 @@ def _outages(rows: list[dict[str, Any]]) -> str:
 
 def survey_text(log: Path, found: Survey) -> str:
     """What is in a log."""
-    table = Table("system", "component", "message", "count", "Hz", box=None, header_style="bold")
-    for column in table.columns[3:]:
+    names = ("system", "component", "message", "count", "Hz", "over time")
+    table = Table(*names, box=None, header_style="bold")
+    for column in table.columns[3:5]:
         column.justify = "right"
     for (system, component, name), message in sorted(found.messages.items()):
         rate = f"{message.rate:.1f}" if message.rate else ""
-        table.add_row(str(system), str(component), name, str(message.count), rate)
+        bars = _bars(message, found.duration)
+        table.add_row(str(system), str(component), name, str(message.count), rate, bars)
     lost = ", ".join(f"{n} of {s}/{c}" for (s, c), n in sorted(found.frames_lost.items()) if n)
     assembly = found.assembly
     gps = found.gps
@@ -155,6 +167,27 @@ def calibration_text(log: Path, found: dict[str, Any]) -> str:
         "of sampling time make",
     ]
     return "\n".join(lines)
+
+
+def pace_rows(found: Survey) -> list[tuple[str, Floats]]:
+    """Every message, and its rate over time, for a picture."""
+    return [
+        (
+            f"{name} {system}/{component} {message.rate:7.1f} Hz",
+            paces(message, found.duration, WIDE),
+        )
+        for (system, component, name), message in sorted(found.messages.items())
+        if message.history is not None
+    ]
+
+
+def _bars(message: MessageCount, duration: float) -> str:
+    """A message's rate over time; a blank where it did not come."""
+    if message.history is None or not duration:
+        return ""
+    shares = paces(message, duration, PARTS)
+    heights = np.clip(np.round(FULL_BAR * shares), shares > 0.0, len(BARS) - 1).astype(int)
+    return "".join(BARS[height] for height in heights)
 
 
 def _worst(values: list[float], deviations: list[float | None]) -> str:

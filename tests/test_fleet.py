@@ -163,7 +163,16 @@ def test_names_are_different_whatever_the_logs_are_called():
     assert found[4] == "c_b"
 
 
-@pytest.mark.parametrize("option", [("--speed", "2"), ("--out", "x.tlog"), ("--plot", "x.png")])
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--speed", "2"),
+        ("--out", "x.tlog"),
+        ("--plot", "x.png"),
+        ("--report", "x"),
+        ("--mcap", "x"),
+    ],
+)
 def test_what_is_for_one_log_is_refused_for_many(logs, option):
     result = call("replay", *logs, *option)
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)

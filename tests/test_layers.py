@@ -18,6 +18,8 @@ LAYERS = [
     {"keys"},
     {"service", "replay", "survey", "calibrate", "experiments"},
     {"fleet", "words", "bench"},
+    {"judgement"},
+    {"report"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

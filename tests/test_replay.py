@@ -12,6 +12,7 @@ from vehicle import Vehicle
 from wire import frame
 
 from risaf_link.config import Config, load
+from risaf_link.core.outage import Errors
 from risaf_link.core.rotation import wrap
 from risaf_link.mavlink.component import Component
 from risaf_link.mavlink.dialect import IDS, pack
@@ -103,16 +104,18 @@ def test_rows_have_the_columns_and_the_precision_that_were_promised(tmp_path):
 
 def test_an_outage_is_scored_against_truth_and_against_what_was_withheld(tmp_path):
     log = simulated(tmp_path / "drive.tlog")
-    replay = Replay(Config(), log, Selection(outages=((6.0, 11.0),)), keep_trace=True)
+    replay = Replay(Config(), log, Selection(outages=((6.0, 11.0),)))
+    trace: list[Errors] = []
+    replay.scorer.listeners.append(trace.append)
     states = [(e.elapsed, e.heading.state.name) for block in replay.blocks() for e in block]
     assert {state for t, state in states if 8.5 < t < 11.0} == {"DEAD_RECKONING"}
     assert [row["reference"] for row in replay.summary()["outages"]] == ["truth", "gps"]
     for row in replay.summary()["outages"]:
         errors = [
             math.degrees(e)
-            for reference, *errors in replay.scorer.trace
-            for t, e in zip(*errors, strict=True)
-            if reference == row["reference"] and 6.0 <= t <= 11.0
+            for errors in trace
+            for t, e in zip(errors.elapsed, errors.error, strict=True)
+            if errors.reference == row["reference"] and 6.0 <= t <= 11.0
         ]
         assert len(errors) > 20
         assert (row["start_s"], row["end_s"]) == (6.0, 11.0)
@@ -197,11 +200,13 @@ class TestRecordings:
 
     @pytest.mark.parametrize("log", sorted(FIXTURES.glob("*.tlog")), ids=lambda path: path.stem)
     def test_the_stated_deviation_of_yaw_is_honest(self, log):
-        replay = Replay(Config(), log, Selection(), keep_trace=True)
+        replay = Replay(Config(), log, Selection())
+        trace: list[Errors] = []
+        replay.scorer.listeners.append(trace.append)
         blocks = list(replay.blocks())
         elapsed = np.concatenate([block.elapsed for block in blocks])
         stds = np.concatenate([block.track.yaw_std for block in blocks])
-        _, times, errors = zip(*replay.scorer.trace, strict=True)
+        _, times, errors, _ = zip(*trace, strict=True)
         times, errors = np.concatenate(times), np.concatenate(errors)
         ratios = np.abs(errors) / np.interp(times, elapsed, stds)
         assert np.mean(ratios < 3.0) > 0.997

@@ -2,9 +2,9 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,15 @@ OVERLAP = 4096  # epochs that are remembered for a reference that comes late
 GATHERED = 16384  # epochs after which they are compared
 
 Reference = Literal["truth", "gps"]
-Errors = tuple[Reference, Floats, Floats]
-"""A reference, elapsed s, rad."""
+
+
+class Errors(NamedTuple):
+    """Heading errors against one reference, at m instants."""
+
+    reference: Reference
+    elapsed: Floats  # (m,) s
+    error: Floats  # (m,) rad, estimated minus reference
+    std: Floats  # (m,) rad, that the filter states for its yaw
 
 
 @dataclass
@@ -57,7 +64,7 @@ class _Yaws:
     """Yaw over the time of one clock, and the references that are to be held against it."""
 
     def __init__(self) -> None:
-        self._points = np.zeros((3, 0))  # us, rad, s elapsed
+        self._points = np.zeros((4, 0))  # us, rad, s elapsed, rad
         self._expected: dict[Reference, list[Floats]] = {"truth": [], "gps": []}  # us, rad
 
     def expect(self, reference: Reference, time_us: Floats, yaw: Floats) -> None:
@@ -65,31 +72,31 @@ class _Yaws:
         self._expected[reference].append(np.array([time_us, yaw]))
 
     def add(self, points: Floats) -> Iterator[Errors]:
-        """Take estimates, (3, k); the errors against references that they reach."""
+        """Take estimates, (4, k); the errors against references that they reach."""
         back = np.flatnonzero(np.diff(points[0]) < 0.0) + 1
         for part in np.split(points, back, axis=1):
             if not part.size:
                 continue
             if self._points.size and part[0, 0] < self._points[0, -1]:
-                self._points = np.zeros((3, 0))  # the clock was set: a track of its own begins
+                self._points = np.zeros((4, 0))  # the clock was set: a track of its own begins
             self._points = np.hstack((self._points, part))
             for reference, expected in self._expected.items():
                 if expected:
-                    yield (reference, *self._compare(reference, *np.hstack(expected)))
+                    yield self._compare(reference, *np.hstack(expected))
             self._points = self._points[:, -OVERLAP:]
 
-    def _compare(self, reference: Reference, time_us: Floats, yaw: Floats) -> tuple[Floats, Floats]:
+    def _compare(self, reference: Reference, time_us: Floats, yaw: Floats) -> Errors:
         times = self._points[0]
         due = time_us <= times[-1]
         self._expected[reference] = [np.array([time_us[~due], yaw[~due]])]
         reached = due & (time_us >= times[0])
-        estimated, elapsed = _between(self._points, time_us[reached])
-        return elapsed, wraps(estimated - yaw[reached])
+        estimated, elapsed, std = _between(self._points, time_us[reached])
+        return Errors(reference, elapsed, wraps(estimated - yaw[reached]), std)
 
 
-def _between(points: Floats, time_us: Floats) -> tuple[Floats, Floats]:
-    """Yaw and elapsed time, interpolated the short way round, at times within the points'."""
-    times, yaw, elapsed = points
+def _between(points: Floats, time_us: Floats) -> tuple[Floats, Floats, Floats]:
+    """Yaw, the short way round, elapsed time and deviation at times within the points'."""
+    times, yaw, elapsed, std = points
     before = np.searchsorted(times, time_us, side="right") - 1
     after = np.minimum(before + 1, len(times) - 1)
     step = times[after] - times[before]
@@ -97,6 +104,7 @@ def _between(points: Floats, time_us: Floats) -> tuple[Floats, Floats]:
     return (
         yaw[before] + part * wraps(yaw[after] - yaw[before]),
         elapsed[before] + part * (elapsed[after] - elapsed[before]),
+        std[before] + part * (std[after] - std[before]),
     )
 
 
@@ -110,23 +118,18 @@ class Scorer:
     parameters : HeadingParameters
     outages : list of Outage
         Those in which GPS is withheld.
-    keep_trace : bool
-        Keep every error, for a plot.
 
     Attributes
     ----------
     truth : ErrorAccount
         Errors against the truth from the first alignment on.
-    trace : list of (str, ndarray, ndarray)
-        Errors of a reference, where they are to be kept: its name, elapsed s, rad.
+    listeners : list of callable
+        Called with errors as they are found.
     """
 
-    def __init__(
-        self, parameters: HeadingParameters, outages: list[Outage], keep_trace: bool
-    ) -> None:
+    def __init__(self, parameters: HeadingParameters, outages: list[Outage]) -> None:
         self.truth = ErrorAccount()
-        self.trace: list[Errors] = []
-        self._keep_trace = keep_trace
+        self.listeners: list[Callable[[Errors], None]] = []
         self._withheld = outages
         self._found: list[Outage] = []
         self._fix_delay_us = round(parameters.delay * 1e6)
@@ -183,8 +186,8 @@ class Scorer:
         yaw, aligned = yaws_of(track.q_nb), track.aligned
         self._follow_outages(elapsed, state)
         for yaws, time_us in ((self._by_boot, boot_us), (self._by_arrival, taken_us)):
-            for errors in yaws.add(np.array([time_us, yaw, elapsed])[:, aligned]):
-                self._account(*errors)
+            for errors in yaws.add(np.array([time_us, yaw, elapsed, track.yaw_std])[:, aligned]):
+                self._account(errors)
 
     def _follow_outages(self, elapsed: Floats, state: NDArray[np.int64]) -> None:
         """Find the outages that the log itself has."""
@@ -198,9 +201,10 @@ class Scorer:
             else:
                 self._found[-1].end = float(elapsed[i])
 
-    def _account(self, reference: Reference, elapsed: Floats, errors: Floats) -> None:
-        if self._keep_trace:
-            self.trace.append((reference, elapsed, errors))
+    def _account(self, found: Errors) -> None:
+        for listener in self.listeners:
+            listener(found)
+        reference, elapsed, errors, _ = found
         if reference == "truth":
             self.truth.add_all(elapsed, errors)
         for outage in (*self._withheld, *self._found):

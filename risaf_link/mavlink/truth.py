@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from risaf_link.core.rotation import Floats, quaternion_from_euler, yaw_of, yaws_of
-from risaf_link.mavlink.dialect import IDS, reader
+from risaf_link.core.rotation import Floats, quaternion_from_euler
+from risaf_link.mavlink.dialect import IDS, name_of, reader
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.tlog import Stamps
 
@@ -41,21 +41,25 @@ def truth_of(frame: Frame) -> Truth | None:
     return None
 
 
-def truths_in(table: FrameTable, times_us: Stamps) -> Iterator[tuple[Floats, Floats, bool]]:
-    """True yaws that are stated in a table.
+@dataclass(frozen=True, slots=True)
+class Truths:
+    """The true attitude at m instants."""
+
+    time_us: Floats  # (m,)
+    received_us: Stamps  # (m,)
+    q_nb: Floats  # (m, 4)
+    by_boot: bool  # whether the times are those of the vehicle's clock, not of the arrival
+    message: str  # that states it
+
+
+def truths_in(table: FrameTable, times_us: Stamps) -> Iterator[Truths]:
+    """True attitudes that are stated in a table.
 
     Parameters
     ----------
     table : FrameTable
     times_us : ndarray of uint64
         When each frame came.
-
-    Yields
-    ------
-    time_us, yaw : ndarray, shape (m,)
-        us and rad.
-    by_boot : bool
-        Whether the times are those of the vehicle's clock, not of the arrival.
     """
     ids, sizes = table.cuts["message_id"], table.cuts["size"]
     whole = (ids == HIL_STATE) & (sizes >= HIL_HEAD.itemsize)
@@ -64,11 +68,19 @@ def truths_in(table: FrameTable, times_us: Stamps) -> Iterator[tuple[Floats, Flo
     heads = payloads.view(HIL_HEAD)[:, 0]
     q_nb = heads["q_nb"].astype(float)
     stated = np.isfinite(q_nb).all(axis=1) & q_nb.any(axis=1)
-    yield heads["time_us"][stated].astype(float), yaws_of(q_nb[stated]), True
+    received_us = times_us[whole][stated]
+    sent_us = heads["time_us"][stated].astype(float)
+    yield Truths(sent_us, received_us, q_nb[stated], True, name_of(HIL_STATE))
     others = np.isin(ids, [HIL_STATE, *_SIM_STATES]) & ~whole
     for row in np.flatnonzero(others).tolist():
         truth = truth_of(table.frame(row))
         if truth:
             by_boot = truth.time_us is not None
             time_us = truth.time_us if truth.time_us is not None else int(times_us[row])
-            yield np.array([float(time_us)]), np.array([yaw_of(truth.q_nb)]), by_boot
+            yield Truths(
+                np.array([float(time_us)]),
+                times_us[row : row + 1],
+                truth.q_nb[np.newaxis],
+                by_boot,
+                name_of(int(ids[row])),
+            )

@@ -1,82 +1,185 @@
-"""The heading over time and its error, as a picture."""
+"""How pictures look: over time, in colours that a colour-blind reader can tell apart.
 
-from collections.abc import Iterable
+The palette is that of Okabe and Ito, "Color Universal Design", 2008.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from risaf_link.core.estimate import EstimateBlock
-from risaf_link.core.heading import HeadingState
-from risaf_link.core.rotation import Floats, yaws_of
+from risaf_link.core.rotation import Floats
 from risaf_link.errors import RisafError
 
-STEP_S = 0.1  # between two points
-MARKERS = {"truth": "truth", "gps": "withheld GPS"}
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BLUE, SKY, ORANGE, VERMILLION, YELLOW = "#0072B2", "#56B4E9", "#E69F00", "#D55E00", "#F0E442"
+INK, GREY = "#222222", "#8A8A8A"
+
+STYLE = {
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": INK,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.linewidth": 0.7,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.grid": True,
+    "grid.color": "#D5D5D5",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 1.4,
+    "legend.columnspacing": 1.2,
+    "legend.borderaxespad": 0.2,
+    "lines.linewidth": 1.1,
+    "text.parse_math": False,  # names come out of logs
+}
+
+PACES = (
+    *(("none", 0.0, "#FFFFFF"), ("below half", 0.5, VERMILLION), ("50 to 80 %", 0.8, ORANGE)),
+    *(("as usual", 1.25, SKY), ("125 to 200 %", 2.0, BLUE), ("above", np.inf, "#0B2E5C")),
+)
+"""Rate of a message as a share of its median: in words, up to where, and as a colour."""
 
 
-class HeadingPlot:
-    """Gathers the course of one run and draws it."""
+@dataclass(frozen=True, slots=True)
+class Size:
+    """For what a picture is made, inches."""
 
-    def __init__(self) -> None:
-        try:
-            import matplotlib as mpl
-        except ImportError:
-            raise RisafError(
-                "--plot needs matplotlib: install risaf-link with the extra `plot`"
-            ) from None
-        mpl.use("Agg")
-        self._points: list[tuple[float, float, float, bool]] = []
+    width: float
+    dpi: int
+    left: float  # margins, the same in all pictures: their times stand below one another
+    legend: int  # entries of a legend in a line
+    lines: int = 1  # of a legend
+    right: float = 0.15
+    scale: float = 1.0  # of heights
 
-    def take(self, block: EstimateBlock) -> None:
-        """Take the next estimates."""
-        track = block.track
-        yaw = np.where(track.aligned, yaws_of(track.q_nb), np.nan)
-        is_out = block.heading.state == HeadingState.DEAD_RECKONING
-        for point in zip(block.elapsed, yaw, track.yaw_std, is_out, strict=True):
-            if not self._points or point[0] >= self._points[-1][0] + STEP_S:
-                self._points.append(point)
+    def figure(
+        self, heights: Sequence[float], title: str = "", lines: int | None = None
+    ) -> tuple["Figure", list["Axes"]]:
+        """Make panels of these heights, one below the other, with room for legends above each."""
+        from matplotlib.figure import Figure
 
-    def draw(self, path: Path, title: str, trace: Iterable[tuple[str, Floats, Floats]]) -> None:
-        """Write the picture.
+        above = 0.17 * (1 + (lines or self.lines))
+        below, heading = 0.44, 0.26 if title else 0.0
+        inches = [height * self.scale for height in heights]
+        total = sum(inches) + above * len(inches) + below + heading
+        made = Figure(figsize=(self.width, total))
+        panels: list[Axes] = []
+        top = total - heading
+        for height in inches:
+            top -= above + height
+            across = (self.width - self.left - self.right) / self.width
+            place = (self.left / self.width, top / total, across, height / total)
+            panel = made.add_axes(place, sharex=panels[0] if panels else None)
+            panel.yaxis.set_label_coords(-(self.left - 0.2) / (across * self.width), 0.5)
+            panels.append(panel)
+        for panel in panels[:-1]:
+            panel.tick_params(labelbottom=False)
+        panels[-1].set_xlabel("time since the first sample (s)")
+        if title:
+            made.text(0.01, 1.0 - 0.06 / total, title, va="top", weight="bold")
+        return made, panels
 
-        Parameters
-        ----------
-        path : Path
-            PNG, or whatever its suffix says.
-        title : str
-        trace : iterable of (str, ndarray, ndarray)
-            Heading errors of a reference: its name, seconds, rad.
-        """
-        from matplotlib import pyplot as plt
 
-        time_s, yaw, std, is_out = np.array(self._points).T
-        figure, (above, below) = plt.subplots(
-            2, 1, sharex=True, figsize=(10, 6), layout="constrained"
+WIDE = Size(width=10.0, dpi=144, left=0.75, legend=6)
+NARROW = Size(width=4.6, dpi=200, left=0.72, legend=3, lines=2, scale=0.9)
+
+
+def require() -> None:
+    """Make sure that pictures can be drawn.
+
+    Raises
+    ------
+    RisafError
+        Without matplotlib.
+    """
+    if not find_spec("matplotlib"):
+        raise RisafError("pictures need matplotlib: install risaf-link with the extra `plot`")
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw in the style of this module."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(STYLE):
+        yield
+
+
+def draw_paces(path: Path, title: str, rows: Sequence[tuple[str, Floats]], duration: float) -> None:
+    """Draw how often each message came over the time of a log.
+
+    Parameters
+    ----------
+    path : Path
+        PNG, or whatever its suffix says.
+    title : str
+    rows : sequence of (str, ndarray)
+        A message, and its rate in equal parts of the time as a share of its median.
+    duration : float
+        s.
+    """
+    require()
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    size = Size(width=10.0, dpi=144, left=3.0, legend=len(PACES))
+    limits = np.array([limit for _, limit, _ in PACES])
+    image = np.array([np.searchsorted(limits, shares) for _, shares in rows])
+    with styled():
+        figure, (panel,) = size.figure((max(0.19 * len(rows), 0.6),), title)
+        panel.imshow(
+            image,
+            aspect="auto",
+            interpolation="nearest",
+            extent=(0.0, max(duration, 1e-3), len(rows) - 0.5, -0.5),
+            cmap=ListedColormap([colour for *_, colour in PACES]),
+            vmin=-0.5,
+            vmax=len(PACES) - 0.5,
         )
-        above.plot(time_s, np.degrees(yaw) % 360, ".", markersize=2, label="estimated")
-        above.set(ylabel="heading (deg)", ylim=(0, 360), yticks=range(0, 361, 90), title=title)
-        std = np.where(np.isnan(yaw), np.nan, np.degrees(std))
-        below.fill_between(time_s, -std, std, alpha=0.2, linewidth=0, label="one sigma, estimated")
-        for reference, label in MARKERS.items():
-            parts = [np.array(part) for name, *part in trace if name == reference]
-            errors = np.hstack(parts) if parts else np.zeros((2, 0))
-            if errors.size:
-                errors_deg = np.degrees(errors[1])
-                below.plot(errors[0], errors_deg, ".", markersize=2, label=f"against {label}")
-        below.set(ylabel="heading error (deg)", xlabel="time since the first sample (s)")
-        for axes in (above, below):
-            axes.fill_between(
-                time_s,
-                0,
-                1,
-                where=is_out > 0,
-                transform=axes.get_xaxis_transform(),
-                color="tab:orange",
-                alpha=0.12,
-                linewidth=0,
-                label="without GPS",
-            )
-            axes.grid(alpha=0.3)
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=4)
-        figure.savefig(path, dpi=120)
-        plt.close(figure)
+        panel.grid(visible=False)
+        panel.set(xlabel="time since the first record (s)", yticks=range(len(rows)))
+        panel.set_yticklabels([name for name, _ in rows], fontsize=8.0)
+        for edge in np.arange(0.5, len(rows) - 1):
+            panel.axhline(edge, color="white", linewidth=1.5)
+        panel.tick_params(axis="y", length=0)
+        patches = [
+            Patch(facecolor=colour, edgecolor=GREY, linewidth=0.4, label=word)
+            for word, _, colour in PACES
+        ]
+        legend(panel, patches, size.legend)
+        save(figure, path, size)
+
+
+def save(figure: "Figure", path: Any, size: Size) -> None:
+    """Write a picture to a path or a file."""
+    try:
+        figure.savefig(path, dpi=size.dpi, facecolor="white")
+    except (OSError, ValueError) as error:  # of matplotlib, if it does not know the suffix
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise RisafError(f"{path}: {reason}") from None
+
+
+def legend(panel: "Axes", handles: Any, across: int) -> None:
+    """Put a legend above a panel, so many entries in a line; `handles` None: all it has."""
+    many = {} if handles is None else {"handles": handles}
+    count = len(panel.get_legend_handles_labels()[1]) if handles is None else len(handles)
+    if count:
+        panel.legend(
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=min(count, across),
+            markerscale=2.0,
+            **many,
+        )
