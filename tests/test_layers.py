@@ -16,7 +16,7 @@ LAYERS = [
     {"config", "sweep"},
     {"kept"},
     {"keys"},
-    {"service", "replay", "survey", "calibrate", "experiments"},
+    {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench"},
     {"judgement"},
     {"report"},
