@@ -109,6 +109,48 @@ def _selected(command: Command) -> Command:
     return start(end(command))
 
 
+class _Address(click.ParamType[Any]):
+    """Where to listen."""
+
+    name = "ADDRESS:PORT"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, int]:
+        if isinstance(value, tuple):
+            return value
+        host, _, port = value.rpartition(":")
+        if not host or not port.isdecimal() or int(port) > 65535:
+            self.fail(f"found {value!r}, expected ADDRESS:PORT, such as 0.0.0.0:8765", param, ctx)
+        return host, int(port)
+
+
+def _listening(command: Command) -> Command:
+    """Add the option that says where a page is served."""
+    return click.option(
+        "--listen",
+        type=_Address(),
+        default="127.0.0.1:8765",
+        show_default=True,
+        help="Where the page is served; on another address than this, everyone there sees it.",
+    )(command)
+
+
+def _tell_page(url: str) -> None:
+    click.echo(f"page at {url} (Ctrl-C ends it)", err=True)
+
+
+@contextmanager
+def _extra(name: str) -> Iterator[None]:
+    """Say which extra is missing where an import fails."""
+    try:
+        yield
+    except ImportError as error:
+        raise RisafError(
+            f"needs {error.name}: install risaf-link with the extra `{name}`"
+        ) from None
+
+
 def _tell_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     """Tell the version, and whether the kernel was built: it need not be imported for that."""
     if not wanted:
@@ -296,6 +338,41 @@ def simulate(
         asyncio.run(until_told(play(frames(chosen), link)))
         counts = link.counts
         click.echo(f"{counts.bytes_out} bytes sent, {counts.dropped_out} frames dropped", err=True)
+
+
+@main.command()
+@click.argument("source", metavar="URL|LOG")
+@_listening
+def monitor(source: str, listen: tuple[str, int]) -> None:
+    """Show vehicles on a page in the browser: live from a link, or from a log.
+
+    A URL is one of those that `run` takes. The page finds the risaf_link components there and asks
+    them for what it shows; nothing else is sent. Needs the extra `monitor`.
+
+    \b
+    risaf-link monitor udpin://0.0.0.0:14550
+    risaf-link monitor udpout://192.168.1.10:14560
+    risaf-link monitor drive.tlog
+    """
+    import asyncio
+    import logging
+
+    with _extra("monitor"):
+        from risaf_link.monitor.server import serve
+    from risaf_link.links import open_link
+    from risaf_link.monitor.recording import Player, open_recording
+    from risaf_link.monitor.source import Live, Log, Source
+    from risaf_link.service import unix_us, until_told
+
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    path = Path(source.removeprefix("tlog://"))
+    shown: Source
+    if "://" in source and not source.startswith("tlog://"):
+        shown = Live(source, open_link(source, "URL", unix_us), unix_us)
+    else:
+        with _progress(path) as progress:
+            shown = Log(path.name, Player(open_recording(path, progress)))
+    asyncio.run(until_told(serve(shown, *listen, _tell_page)))
 
 
 @main.command()
