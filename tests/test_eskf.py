@@ -135,6 +135,17 @@ def test_the_covariance_of_the_angles_is_that_of_the_attitude(angles):
     assert np.abs(found[0, 1]) > 1e-3 * std[0] * std[1]
 
 
+def test_the_bias_is_known_as_well_as_the_start_and_rest_tell():
+    estimator = Eskf(DEFAULTS)
+    run(estimator, 0.01)
+    start = DEFAULTS.initial_bias_std
+    assert estimator.state(0).bias_std == pytest.approx([start] * 3, rel=1e-3)
+    rest = np.array([1.0, 2.0, 3.0]) * 1e-3  # rad/s
+    estimator.correct_zero_rate(np.zeros(3), np.square(rest), confirmed=True)
+    both = 1.0 / np.sqrt(1.0 / start**2 + 1.0 / np.square(rest))
+    assert estimator.state(0).bias_std == pytest.approx(both, rel=1e-3)
+
+
 def test_an_error_of_scale_grows_with_the_angle_turned_and_goes_with_turning_back():
     known = set_parameters(DEFAULTS, initial_bias_std=1e-9, turn_error=0.0)
     estimator = aligned_filter(std=1e-3, parameters=known)

@@ -274,13 +274,15 @@ def test_what_is_asked_for_beside_it_says_the_same(drive):
     assert status.mag_ratio == pytest.approx(estimate.heading.innovation.test_ratio, rel=1e-6)
     assert math.isnan(status.vel_ratio)
     assert math.isnan(status.pos_horiz_accuracy)
-    named = heard([emitter.tell("NAMED_VALUE_FLOAT", estimate) for _ in range(16)])
+    named = heard([emitter.tell("NAMED_VALUE_FLOAT", estimate) for _ in range(22)])
     values = {message.name: message.value for message in named}
-    assert [message.name for message in named[:8]] == [message.name for message in named[8:]]
-    assert len(values) == 8
+    assert [message.name for message in named[:11]] == [message.name for message in named[11:]]
+    assert len(values) == 11
     assert values["yaw_std"] == pytest.approx(estimate.attitude.yaw_std, rel=1e-6)
     assert values["hdg_ratio"] == pytest.approx(status.mag_ratio)
     assert values["bias_z"] == pytest.approx(estimate.attitude.bias_b[2], rel=1e-6, abs=1e-12)
+    std = [values[f"bias_std_{axis}"] for axis in "xyz"]
+    assert std == pytest.approx(estimate.attitude.bias_std, rel=1e-6)
     assert (values["healthy"], values["dead"]) == (5, 0)
 
 

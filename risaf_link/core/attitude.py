@@ -90,6 +90,8 @@ class AttitudeState:
     resets: int  # how often yaw was set, also by filters before this one
     common: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) rad^2, covariances of roll with pitch, of roll with yaw, of pitch with yaw"""
+    bias_std: Floats = field(default_factory=lambda: np.full(3, math.nan))
+    """(3,) rad/s"""
 
     @property
     def angle_covariance(self) -> Floats:
@@ -276,6 +278,7 @@ class PaperFilter:
             self._resets > 0,
             self._resets,
             common,
+            np.sqrt(np.diag(self._covariance)[BIAS]),
         )
 
     def _integrate(self, rate: Floats, variance: Floats, dt: float) -> None:

@@ -382,6 +382,7 @@ class Eskf:
             self._aligned,
             self._resets,
             common,
+            np.sqrt(np.diag(self._covariance)[BIAS]),
         )
 
     def _rotation(self, dt: float) -> Vector:

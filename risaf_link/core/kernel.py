@@ -215,9 +215,9 @@ class _Eskf:
 
     def state(self, time_us: int) -> AttitudeState:
         """Read the estimate as of the last predict."""
-        q_nb, rate_b, bias_b, std, common, aligned, resets = self.kernel.state()
+        q_nb, rate_b, bias_b, std, common, aligned, resets, bias_std = self.kernel.state()
         roll, pitch, yaw = std
-        known = aligned, resets, np.array(common)
+        known = aligned, resets, np.array(common), np.array(bias_std)
         return AttitudeState(time_us, q_nb, rate_b, bias_b, roll, pitch, yaw, *known)
 
 

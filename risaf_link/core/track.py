@@ -14,8 +14,8 @@ Q_NB, RATE, BIAS, STD = slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13)
 ALIGNED, RESETS = 13, 14
 FUSED, VARIANCE, NOISE, WALK = slice(15, 18), slice(18, 21), slice(21, 24), slice(24, 27)
 ACTIVE, VALID, AHEAD = slice(27, 30), 30, 31
-COMMON = slice(32, 35)
-COLUMNS = 35
+COMMON, BIAS_STD = slice(32, 35), slice(35, 38)
+COLUMNS = 38
 YAW_STD = 12
 
 
@@ -24,7 +24,7 @@ class Track:
 
     Parameters
     ----------
-    values : ndarray, shape (k, 35)
+    values : ndarray, shape (k, 38)
         The columns that this module names; units are those of `FusedRate` and `AttitudeState`.
     """
 
@@ -41,7 +41,7 @@ class Track:
                     (state.roll_std, state.pitch_std, state.yaw_std, state.aligned, state.resets),
                     *(fused.rate_b, fused.variance, fused.noise, fused.bias_walk, fused.active),
                     (fused.valid, _ahead(state.q_nb, force_b)),
-                    state.common,
+                    *(state.common, state.bias_std),
                 )
             )
             for fused, state, force_b in epochs
@@ -116,7 +116,7 @@ class Track:
         """The attitude at one epoch."""
         row = self.values[i]
         roll, pitch, yaw, aligned, resets = row[STD.start : RESETS + 1].tolist()
-        known = aligned > 0.0, int(resets), row[COMMON]
+        known = aligned > 0.0, int(resets), row[COMMON], row[BIAS_STD]
         return AttitudeState(time_us, row[Q_NB], row[RATE], row[BIAS], roll, pitch, yaw, *known)
 
 

@@ -303,6 +303,9 @@ _NAMED: tuple[tuple[str, Callable[[Estimate], float]], ...] = (
     ("bias_x", lambda e: float(e.attitude.bias_b[0])),  # rad/s
     ("bias_y", lambda e: float(e.attitude.bias_b[1])),
     ("bias_z", lambda e: float(e.attitude.bias_b[2])),
+    ("bias_std_x", lambda e: float(e.attitude.bias_std[0])),  # rad/s
+    ("bias_std_y", lambda e: float(e.attitude.bias_std[1])),
+    ("bias_std_z", lambda e: float(e.attitude.bias_std[2])),
     ("healthy", lambda e: float(e.array.health.count(SensorState.HEALTHY))),  # sensors
     ("dead", lambda e: float(e.array.health.count(SensorState.DEAD))),
 )

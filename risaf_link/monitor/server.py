@@ -1,7 +1,8 @@
 """The web server: one page, and a stream of what it shows.
 
 The stream is of server-sent events, a JSON object each: `view.Update`. A page that reads slowly
-gets fewer of them. Nothing goes from the page to the vehicle; what it may say is how a log is played.
+gets fewer of them. Nothing goes from the page to the vehicle; what it may say is how a log is
+played.
 """
 
 import asyncio

@@ -148,6 +148,14 @@ class Eskf {
     return sum;
   }
 
+  Vector bias_std() const {
+    Vector std;
+    for (std::size_t i = 0; i < 3; ++i) {
+      std[i] = std::sqrt(covariance_[BIAS + i][BIAS + i]);
+    }
+    return std;
+  }
+
   // Standard deviations of roll, pitch and yaw, half a turn at most; covariances of roll with
   // pitch, of roll with yaw, of pitch with yaw.
   struct AngleSpread {

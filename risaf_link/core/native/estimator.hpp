@@ -15,7 +15,7 @@ struct Known {
   double q_nb[4], rate_b[3], bias_b[3], angle_std[3], aligned, resets;
   double fused[3], variance[3], noise[3], bias_walk[3], active[3], valid;
   double ahead;
-  double common[3];
+  double common[3], bias_std[3];
 };
 
 // Carry the attitude on over `epochs`, with readings of `n` gyros and `m` accelerometers each.
@@ -35,6 +35,7 @@ void advance(Fusion& gyros, Robust& accelerometers, Eskf& filter, Aiding& aiding
     aiding.take(filter, {fused[0].rate, fused[1].rate, fused[2].rate}, force_b, dt[i]);
     const Quaternion q_nb = filter.attitude();
     const auto [std, common] = filter.angle_spread();
+    const Vector bias_std = filter.bias_std();
     known->q_nb[0] = q_nb.w;
     known->q_nb[1] = q_nb.x;
     known->q_nb[2] = q_nb.y;
@@ -44,6 +45,7 @@ void advance(Fusion& gyros, Robust& accelerometers, Eskf& filter, Aiding& aiding
       known->bias_b[k] = filter.bias()[k];
       known->angle_std[k] = std[k];
       known->common[k] = common[k];
+      known->bias_std[k] = bias_std[k];
       known->fused[k] = fused[k].rate;
       known->variance[k] = fused[k].variance;
       known->noise[k] = fused[k].noise;

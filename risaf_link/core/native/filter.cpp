@@ -96,7 +96,8 @@ Array<double> covariance(const Eskf& filter) {
   return owned(values, {risaf::STATES, risaf::STATES});
 }
 
-// q_nb, rate, bias, standard deviations of the angles, their covariances, aligned, resets.
+// q_nb, rate, bias, standard deviations of the angles, their covariances, aligned, resets, standard
+// deviations of the bias.
 nb::tuple state(const Eskf& filter) {
   const auto [w, x, y, z] = filter.attitude();
   const Vector &rate = filter.rate(), &bias = filter.bias();
@@ -104,7 +105,7 @@ nb::tuple state(const Eskf& filter) {
   return nb::make_tuple(owned(new double[4]{w, x, y, z}, {4}),
                         owned(new double[3]{rate[0], rate[1], rate[2]}, {3}),
                         owned(new double[3]{bias[0], bias[1], bias[2]}, {3}), std, common,
-                        filter.aligned(), filter.resets());
+                        filter.aligned(), filter.resets(), filter.bias_std());
 }
 
 template <typename Fusion>
