@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -308,7 +309,8 @@ def simulate(
 
     SCENARIO is one of `circle` (the paper's: noise, random walks of the biases, spikes), `drive1`
     (constant speed, GPS cut after 100 s), `drive2` (an unpaved road, a third of the array shocked,
-    a long outage of GPS) and `ekf2` (one sound IMU). The truth is in HIL_STATE_QUATERNION.
+    a long outage of GPS), `ekf2` (one sound IMU) and `demo` (an hour in which sensors and GPS come
+    and go). The truth is in HIL_STATE_QUATERNION.
 
     \b
     risaf-link simulate circle --seed 1 --out circle.tlog
@@ -373,6 +375,29 @@ def monitor(source: str, listen: tuple[str, int]) -> None:
         with _progress(path) as progress:
             shown = Log(path.name, Player(open_recording(path, progress)))
     asyncio.run(until_told(serve(shown, *listen, _tell_page)))
+
+
+@main.command()
+@click.option("--seed", type=int, default=1, metavar="N", help="Of the drive and its faults.")
+@_listening
+def demo(seed: int, listen: tuple[str, int]) -> None:
+    """Show it all without hardware: a simulated vehicle, the service, and the page.
+
+    Faults of sensors and of GPS come and go. Needs the extra `monitor`.
+
+    \b
+    risaf-link demo
+    """
+    import asyncio
+    import logging
+
+    with _extra("monitor"):
+        from risaf_link.demo import demo as show
+    from risaf_link.service import unix_us, until_told
+
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    tell = partial(click.echo, err=True)
+    asyncio.run(until_told(show(listen, seed, unix_us, tell)))
 
 
 @main.command()

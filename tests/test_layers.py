@@ -17,7 +17,7 @@ LAYERS = [
     {"kept"},
     {"keys"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
-    {"fleet", "words", "bench"},
+    {"fleet", "words", "bench", "demo"},
     {"judgement"},
     {"report"},
     {"cli"},

@@ -17,7 +17,7 @@ from risaf_link.sim.equipment import (
     EKF2_RECEIVER,
     WARMING,
 )
-from risaf_link.sim.failures import Frozen, Saturated
+from risaf_link.sim.failures import Frozen, Invalid, Saturated
 from risaf_link.sim.faults import FAULTS, choose
 from risaf_link.sim.receiver import ReceiverParameters
 from risaf_link.sim.receiver_faults import ReceiverFault
@@ -145,11 +145,33 @@ def _ekf2(generator: np.random.Generator) -> Scenario:
     )
 
 
+def _demo(generator: np.random.Generator) -> Scenario:
+    """A drive of an hour on which faults come and go, to be looked at."""
+    duration = 3600.0
+    return Scenario(
+        "demo",
+        paved(generator),
+        CONSUMER_GYROS,
+        CONSUMER_ACCELEROMETERS,
+        receiver=ReceiverParameters(),
+        duration=duration,
+        sensors=120,
+        rate=100.0,
+        faults={
+            "spikes": FAULTS["spikes"],
+            "shocks": Shocks(share=0.1, spacing=150.0, peak=radians(20.0), decay=0.3),
+            "invalid": Invalid(share=0.1, every=60.0, length=20.0),
+        },
+        outages=tuple((start, start + 40.0) for start in np.arange(60.0, duration, 120.0).tolist()),
+    )
+
+
 SCENARIOS: dict[str, Callable[[np.random.Generator], Scenario]] = {
     "circle": _circle,
     "drive1": _drive1,
     "drive2": _drive2,
     "ekf2": _ekf2,
+    "demo": _demo,
 }
 """Every scenario by its name; made with what is drawn for its route."""
 

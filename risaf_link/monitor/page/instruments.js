@@ -73,7 +73,7 @@ export class Horizon { // rad
     add(this.world, "rect", { x: -200, y: 0, width: 400, height: 400, fill: "var(--soil)" });
     add(this.world, "line", { x1: -200, x2: 200, stroke: "var(--text)", "stroke-width": 1.5 });
     for (const d of [-30, -20, -10, 10, 20, 30]) {
-      const y = -d * 2.4;
+      const y = -d * 2.1;
       add(this.world, "line", { x1: -18, x2: 18, y1: y, y2: y, stroke: "var(--muted)" });
       add(this.world, "text", { x: 32, y }, `${Math.abs(d)}°`);
     }
@@ -87,7 +87,7 @@ export class Horizon { // rad
     show(this.world, roll !== null);
     if (roll === null) return;
     const turn = 360 / TAU;
-    this.world.setAttribute("transform", `rotate(${-roll * turn}) translate(0 ${pitch * turn * 2.4})`);
+    this.world.setAttribute("transform", `rotate(${-roll * turn}) translate(0 ${pitch * turn * 2.1})`);
   }
 }
 

@@ -24,12 +24,13 @@ const past = { rows: [], span: 180, cursorUs: null, nowUs: 0, playback: null, vi
 const degOf = (i) => (row) => deg(row[i]);
 const axis = (i, k, factor = 1) => (row) => row[i][k] === null ? null : deg(row[i][k]) * factor;
 const timelines = [
-  { title: "Heading", unit: "deg", wraps: 360, lines: [
+  { title: "Heading", unit: "deg", wraps: 360, least: 20, lines: [
     { label: "GPS", colour: "--gps", value: (row) => compassDeg(row[GPS]), dots: true },
     { label: "estimated ± 2σ", colour: "--estimate", value: (row) => compassDeg(row[YAW]), band: (row) => 2 * deg(row[YAW_STD]) },
   ] },
+  { title: "Deviation of heading", unit: "deg", from: 0, least: 0.5, digits: 2, lines: [{ label: "σ", colour: "--estimate", value: (row) => row[YAW] === null ? null : deg(row[YAW_STD]) }] },
   { title: "Innovation", unit: "deg", least: 1, digits: 2, lines: [
-    { label: "gate", colour: "--good", value: (row) => row[GATE] === null ? null : 0, band: degOf(GATE) },
+    { label: "gate ±", colour: "--good", value: (row) => row[GATE] === null ? null : 0, band: degOf(GATE), tell: degOf(GATE) },
     { label: "innovation", colour: "--estimate", value: degOf(INNOVATION), dots: true },
   ] },
   { title: "Test ratio", unit: "", from: 0, least: 1.2, digits: 2, marks: [{ level: 0.5, colour: "--amber" }, { level: 1, colour: "--red" }], lines: [
@@ -69,6 +70,7 @@ function showFusion(known, silence) {
   text("state", word);
   $("state").className = `state ${kind}`;
   $("state").dataset.sign = sign;
+  document.title = h ? `${number(compassDeg(h.yaw))}° ${word}` : "risaf_link";
   const since = h?.time_since_fused ?? null;
   text("since", since === null ? "no heading was fused yet" : `last fused ${words.ageText(since + silence)} ago`);
   instruments.innovation.draw(deg(h?.innovation), deg(known?.gate), h?.test_ratio ?? 0);
@@ -179,9 +181,10 @@ function showChoice(update) {
 
 function drawPast() {
   const style = getComputedStyle(document.documentElement);
-  const toUs = past.nowUs, fromUs = toUs - past.span * 1e6;
+  const beginUs = past.playback?.begin_us ?? 0, fromUs = Math.max(beginUs, past.nowUs - past.span * 1e6);
+  const toUs = fromUs + past.span * 1e6;
   past.view = {
-    fromUs, toUs, cursorUs: past.cursorUs, zeroUs: past.playback?.begin_us ?? 0,
+    fromUs, toUs, cursorUs: past.cursorUs, zeroUs: beginUs,
     timeText: (us) => words.timeText(us, past.playback),
     isOut: (row) => row[STATE] === words.DEAD_RECKONING,
     colour: (name) => style.getPropertyValue(name),

@@ -2,7 +2,9 @@
 
 const MARGIN = { left: 46, right: 8, top: 8, bottom: 20 };
 const GAP_S = 1.5; // between two rows: the line is broken
-const STEPS = [1, 2, 2.5, 5, 10];
+const STEPS = [1, 2, 5, 10];
+const TURN_STEPS = [5, 10, 15, 30, 45, 90]; // deg
+const OUTLIERS = 0.02; // share at either end that does not set the range
 const TIME_STEPS = [5, 10, 15, 30, 60, 120, 300];
 
 function niceStep(range, count) {
@@ -10,8 +12,9 @@ function niceStep(range, count) {
   return power * STEPS.find((step) => step * power >= rough * 0.999);
 }
 
-// A panel. `lines`: { label, colour, value(row), dots, band(row) }, in the unit of the panel; `marks`:
-// levels with a colour; `wraps`: 360 where values go round; `least`: the smallest range shown.
+// A panel. `lines`: { label, colour, value(row), dots, band(row), tell(row) }, in the unit of the panel, the
+// leading one last; `marks`: levels with a colour; `wraps`: 360 where values go round; `least`: the smallest
+// range shown; `from`: where it begins.
 export class Timeline {
   constructor(parent, { title, unit, lines, marks = [], wraps = 0, least = 1, from = null, digits = 1 }) {
     Object.assign(this, { unit, lines, marks, wraps, least, from, digits });
@@ -42,6 +45,11 @@ export class Timeline {
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.clearRect(0, 0, width, height);
     c.font = "11px system-ui, 'DejaVu Sans', sans-serif";
+    if (this.wraps) {
+      const { value } = this.lines.at(-1), row = rows.findLast((r) => value(r) !== null);
+      this.middle = row ? value(row) : 0;
+    }
+    for (const line of this.lines) line.shown = this.#unwrapped(line);
     const [low, high] = this.#range(rows);
     const x = (us) => MARGIN.left + (us - view.fromUs) / (view.toUs - view.fromUs) * (width - MARGIN.left - MARGIN.right);
     const y = (value) => height - MARGIN.bottom - (value - low) / (high - low) * (height - MARGIN.top - MARGIN.bottom);
@@ -51,24 +59,37 @@ export class Timeline {
     c.beginPath();
     c.rect(MARGIN.left, MARGIN.top - 2, width - MARGIN.left - MARGIN.right, height - MARGIN.top - MARGIN.bottom + 4);
     c.clip();
-    for (const line of this.lines) this.#line(c, line, rows, x, y, view);
+    for (const line of this.lines) this.#line(c, line, rows, x, y, [low, high], view);
     c.restore();
     this.#tell(c, rows, x, height, view);
   }
 
+  // What goes round is shown around its last value, so that its course has no jump there.
+  #unwrapped({ value }) {
+    if (!this.wraps) return value;
+    const middle = this.middle, turn = this.wraps;
+    return (row) => {
+      const v = value(row);
+      return v === null ? null : v - turn * Math.round((v - middle) / turn);
+    };
+  }
+
   #range(rows) {
-    if (this.wraps) return [0, this.wraps];
-    let low = Infinity, high = -Infinity;
-    for (const row of rows) {
-      for (const { value, band } of this.lines) {
-        const v = value(row);
+    const lows = [], highs = [];
+    for (const { band, shown } of this.lines) {
+      for (const row of rows) {
+        const v = shown(row);
         if (v === null) continue;
-        const half = band ? Math.min(band(row) ?? 0, 5 * Math.max(this.least, Math.abs(v))) : 0;
-        low = Math.min(low, v - half);
-        high = Math.max(high, v + half);
+        const half = band ? Math.min(band(row) ?? 0, this.wraps / 2 || Infinity) : 0;
+        lows.push(v - half);
+        highs.push(v + half);
       }
     }
-    for (const { level } of this.marks) { low = Math.min(low, level); high = Math.max(high, level); }
+    lows.sort((a, b) => b - a);
+    highs.sort((a, b) => a - b);
+    const last = Math.floor((lows.length - 1) * (1 - OUTLIERS));
+    const levels = this.marks.map(({ level }) => level);
+    let low = Math.min(lows[last] ?? Infinity, ...levels), high = Math.max(highs[last] ?? -Infinity, ...levels);
     if (low > high) [low, high] = [0, 0];
     if (this.from !== null) low = this.from;
     const room = Math.max(high - low, this.least), middle = (low + high) / 2;
@@ -95,13 +116,14 @@ export class Timeline {
     c.lineWidth = 1;
     c.textAlign = "right";
     c.textBaseline = "middle";
-    const step = this.wraps ? this.wraps / 4 : niceStep(high - low, 4);
-    const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) + (step.toPrecision(2).includes("25") ? 1 : 0);
+    const step = this.wraps ? TURN_STEPS.find((s) => s >= (high - low) / 5) ?? 90 : niceStep(high - low, 4);
+    const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+    const label = (value) => (this.wraps ? ((value % this.wraps) + this.wraps) % this.wraps : Math.abs(value) < step / 1e6 ? 0 : value);
     c.beginPath();
     for (let value = Math.ceil(low / step - 1e-9) * step; value <= high + 1e-9; value += step) {
       c.moveTo(MARGIN.left, y(value));
       c.lineTo(width - MARGIN.right, y(value));
-      c.fillText((Math.abs(value) < step / 1e6 ? 0 : value).toFixed(this.wraps ? 0 : digits).replace("-", "−"), MARGIN.left - 6, y(value));
+      c.fillText(label(value).toFixed(digits).replace("-", "−"), MARGIN.left - 6, y(value));
     }
     c.stroke();
     c.textAlign = "center";
@@ -122,12 +144,12 @@ export class Timeline {
     }
   }
 
-  #line(c, { value, band, dots, colour }, rows, x, y, view) {
+  #line(c, { shown: value, band, dots, colour }, rows, x, y, [low, high], view) {
     c.strokeStyle = c.fillStyle = view.colour(colour);
-    if (dots) {
+    if (dots) { // those that are out of range stand at its edge
       for (const row of rows) {
         const v = value(row);
-        if (v !== null) c.fillRect(x(row[0]) - 1.5, y(v) - 1.5, 3, 3);
+        if (v !== null) c.fillRect(x(row[0]) - 1.5, y(Math.max(low, Math.min(high, v))) - 1.5, 3, 3);
       }
       return;
     }
@@ -154,8 +176,9 @@ export class Timeline {
     let before = null;
     for (const row of rows) {
       const v = value(row);
-      if (v === null) { before = null; continue; }
-      const isBroken = !before || row[0] - before[0] > GAP_S * 1e6 || (this.wraps && Math.abs(v - value(before)) > this.wraps / 2);
+      if (v === null) continue;
+      const turned = this.wraps && before ? Math.abs(v - value(before)) : 0;
+      const isBroken = !before || row[0] - before[0] > GAP_S * 1e6 || turned > this.wraps / 2;
       if (isBroken) runs.push([]);
       runs.at(-1).push(row);
       before = row;
@@ -175,10 +198,9 @@ export class Timeline {
       c.lineTo(x(row[0]), height - MARGIN.bottom);
       c.stroke();
     }
-    this.lines.forEach(({ value, dots }, i) => {
-      let told = row;
-      if (row && dots) told = rows.findLast((r) => r[0] <= row[0] && value(r) !== null);
-      const v = told ? value(told) : null;
+    this.lines.forEach(({ value, tell = value }, i) => {
+      const told = row && rows.findLast((r) => r[0] <= row[0] && value(r) !== null);
+      const v = told ? tell(told) : null;
       this.values[i].textContent = v === null ? "–" : v.toFixed(this.digits).replace("-", "−");
     });
   }

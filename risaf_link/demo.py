@@ -1,0 +1,127 @@
+"""A demonstration without hardware: a simulated vehicle, the service, and the page.
+
+Vehicle and service are processes of their own, the same commands that a person would type.
+"""
+
+import asyncio
+import socket
+import sys
+from asyncio.subprocess import Process
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from typing import Any
+
+from risaf_link.errors import RisafError
+from risaf_link.links import open_link
+from risaf_link.monitor.server import serve
+from risaf_link.monitor.source import Live
+
+HOST = "127.0.0.1"
+GROUND_PORT = 14550  # where ground stations listen
+END_S = 5.0  # in which a process that was asked to end must do so
+GRACE_S = 0.5  # in which we hear of Ctrl-C ourselves, after a process that it ended
+
+
+async def demo(
+    listen: tuple[str, int], seed: int, clock_us: Callable[[], int], tell: Callable[[str], None]
+) -> None:
+    """Run until cancelled, or until the drive is over.
+
+    Parameters
+    ----------
+    listen : (str, int)
+        Where the page is served.
+    seed : int
+        Of the drive and its faults.
+    clock_us : callable
+        Microseconds since 1970.
+    tell : callable
+        Told line by line what was started.
+
+    Raises
+    ------
+    RisafError
+        If one of the processes fails.
+    """
+    vehicle_port, page_port = _free_ports(2)
+    links = (
+        f"{{name: vehicle, url: 'udpin://{HOST}:{vehicle_port}', emit: {{}}}}",
+        f"{{name: page, url: 'udpin://{HOST}:{page_port}'}}",
+        f"{{name: ground, url: 'udpout://{HOST}:{GROUND_PORT}'}}",
+    )
+    commands = {
+        "service": ("run", "--set", f"links=[{', '.join(links)}]"),
+        "vehicle": (
+            *("simulate", "demo", "--seed", str(seed)),
+            *("--live", f"udpout://{HOST}:{vehicle_port}"),
+        ),
+    }
+    url = f"udpout://{HOST}:{page_port}"
+    async with AsyncExitStack() as started:
+        processes = {
+            name: await started.enter_async_context(_running(*command))
+            for name, command in commands.items()
+        }
+        tell("service  risaf-link run")
+        tell("vehicle  simulated: 120 gyros, shocked at times; some fall silent and come back;")
+        tell("         40 s of every 2 minutes without GPS")
+        tell(f"MAVLink  any ground station on UDP port {GROUND_PORT} sees it as well")
+
+        def tell_page(page: str) -> None:
+            tell(f"page     {page}")
+            tell("Ctrl-C ends all of it.")
+
+        shown = Live(url, open_link(url, "page", clock_us), clock_us)
+        page = asyncio.create_task(serve(shown, *listen, tell_page))
+        await _until_one_ends(page, processes, tell)
+
+
+async def _until_one_ends(
+    page: "asyncio.Task[None]", processes: dict[str, Process], tell: Callable[[str], None]
+) -> None:
+    ends = {name: asyncio.create_task(p.wait()) for name, p in processes.items()}
+    tasks: list[asyncio.Task[Any]] = [page, *ends.values()]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if page.done():
+            page.result()
+        await asyncio.sleep(GRACE_S)
+        name, status = next((name, end.result()) for name, end in ends.items() if end.done())
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+    if status or name == "service":
+        raise RisafError(f"the {name} ended with status {status}")
+    tell("The drive is over.")
+
+
+@asynccontextmanager
+async def _running(*arguments: str) -> AsyncIterator[Process]:
+    """Run one of our commands as a process, which ends with the block."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "risaf_link.cli", *arguments, stdin=asyncio.subprocess.DEVNULL
+    )
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            process.terminate()
+        try:
+            async with asyncio.timeout(END_S):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+
+
+def _free_ports(count: int) -> list[int]:
+    """UDP ports that nobody uses now."""
+    with_ports = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    try:
+        for each in with_ports:
+            each.bind((HOST, 0))
+        return [each.getsockname()[1] for each in with_ports]
+    finally:
+        for each in with_ports:
+            each.close()
