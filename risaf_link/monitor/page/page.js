@@ -8,7 +8,7 @@ import { compassDeg, deg, deviation, number, signed } from "./words.js";
 
 const STALE_S = 2; // without a message: it is said, plainly
 const CUT_MS = 3000; // without an update: the program that serves the page has gone
-const REDRAW_MS = 1000; // of lines to which nothing is added
+const REDRAW_MS = 450; // of the lines over time, which are dear
 const MOST_ROWS = 3000, MOST_EVENTS = 200;
 const PER_HOUR = 3600;
 const [TIME, YAW, YAW_STD, GPS, INNOVATION, GATE, RATIO, STATE, ROLL, PITCH, ROLL_STD, PITCH_STD, RATE, BIAS, BIAS_STD, HEALTHY, SUSPECT, DEAD] = Array(18).keys();
@@ -218,7 +218,7 @@ function show(update) {
   if (update.sensors) sensors.draw(update.sensors);
   showHeard(update);
   showEvents(update);
-  if (update.rows.length || update.is_new || lastUpdateMs - lastDrawnMs > REDRAW_MS) {
+  if (update.is_new || lastUpdateMs - lastDrawnMs > REDRAW_MS) {
     lastDrawnMs = lastUpdateMs;
     drawing ||= requestAnimationFrame(() => { drawing = 0; drawPast(); });
   }
