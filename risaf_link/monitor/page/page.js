@@ -65,12 +65,13 @@ function showHeading(known, isOut) {
   text("speed-now", number(h?.speed, 1, " m/s"));
 }
 
-function showFusion(known, silence) {
+function showFusion(known, silence, isOut) {
   const h = known?.heading;
   const [word, kind, sign] = words.STATES[h?.state] ?? ["not known", "", "?"];
   text("state", word);
   $("state").className = `state ${kind}`;
   $("state").dataset.sign = sign;
+  $("fusion").classList.toggle("old", isOut);
   document.title = h ? `${number(compassDeg(h.yaw))}° ${word}` : "risaf_link";
   const since = h?.time_since_fused ?? null;
   text("since", since === null ? "no heading was fused yet" : `last fused ${words.ageText(since + silence)} ago`);
@@ -182,8 +183,9 @@ function showChoice(update) {
 
 function drawPast() {
   const style = getComputedStyle(document.documentElement);
-  const beginUs = past.playback?.begin_us ?? 0, fromUs = Math.max(beginUs, past.nowUs - past.span * 1e6);
-  const toUs = fromUs + past.span * 1e6;
+  const { begin_us: beginUs, end_us: endUs } = past.playback ?? { begin_us: 0, end_us: Infinity };
+  const spanUs = Math.min(past.span * 1e6, endUs - beginUs), fromUs = Math.max(beginUs, past.nowUs - spanUs);
+  const toUs = fromUs + spanUs;
   past.view = {
     fromUs, toUs, cursorUs: past.cursorUs, zeroUs: beginUs,
     timeText: (us) => words.timeText(us, past.playback),
@@ -211,8 +213,9 @@ function show(update) {
   showPlayer(update);
   showChoice(update);
   showFreshness(update, silence);
-  showHeading(known, known?.heading?.state === words.DEAD_RECKONING);
-  showFusion(known, silence > STALE_S ? silence : 0);
+  const isOut = known?.heading?.state === words.DEAD_RECKONING;
+  showHeading(known, isOut);
+  showFusion(known, silence > STALE_S ? silence : 0, isOut);
   showAttitude(known);
   showArray(known);
   if (update.sensors) sensors.draw(update.sensors);

@@ -1,5 +1,7 @@
 // Lines over time on a canvas. All of them share one span and one cursor.
 
+import { number } from "./words.js";
+
 const MARGIN = { left: 46, right: 8, top: 8, bottom: 20 };
 const GAP_S = 1.5; // between two rows: the line is broken
 const STEPS = [1, 2, 5, 10];
@@ -61,6 +63,11 @@ export class Timeline {
     c.clip();
     for (const line of this.lines) this.#line(c, line, rows, x, y, [low, high], view);
     c.restore();
+    if (rows.length && !rows.some((row) => this.lines.some(({ value }) => value(row) !== null))) {
+      c.fillStyle = view.colour("--muted");
+      c.textAlign = "center";
+      c.fillText("not told", width / 2, height / 2);
+    }
     this.#tell(c, rows, x, height, view);
   }
 
@@ -118,12 +125,12 @@ export class Timeline {
     c.textBaseline = "middle";
     const step = this.wraps ? TURN_STEPS.find((s) => s >= (high - low) / 5) ?? 90 : niceStep(high - low, 4);
     const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-    const label = (value) => (this.wraps ? ((value % this.wraps) + this.wraps) % this.wraps : Math.abs(value) < step / 1e6 ? 0 : value);
+    const label = (value) => (this.wraps ? ((value % this.wraps) + this.wraps) % this.wraps : value);
     c.beginPath();
     for (let value = Math.ceil(low / step - 1e-9) * step; value <= high + 1e-9; value += step) {
       c.moveTo(MARGIN.left, y(value));
       c.lineTo(width - MARGIN.right, y(value));
-      c.fillText(label(value).toFixed(digits).replace("-", "−"), MARGIN.left - 6, y(value));
+      c.fillText(number(label(value), digits), MARGIN.left - 6, y(value));
     }
     c.stroke();
     c.textAlign = "center";
@@ -201,7 +208,7 @@ export class Timeline {
     this.lines.forEach(({ value, tell = value }, i) => {
       const told = row && rows.findLast((r) => r[0] <= row[0] && value(r) !== null);
       const v = told ? tell(told) : null;
-      this.values[i].textContent = v === null ? "–" : v.toFixed(this.digits).replace("-", "−");
+      this.values[i].textContent = number(v ?? null, this.digits);
     });
   }
 

@@ -18,11 +18,13 @@ export const deg = (rad) => rad === null || rad === undefined ? null : rad * 180
 export const compassDeg = (rad) => rad === null || rad === undefined ? null : ((deg(rad) % 360) + 360) % 360;
 
 export function number(value, digits = 0, unit = "") {
-  return value === null || value === undefined ? "–" : value.toFixed(digits) + unit;
+  if (value === null || value === undefined) return "–";
+  const text = value.toFixed(digits);
+  return (Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−")) + unit;
 }
 
 export function signed(value, digits, unit = "") {
-  return value > 0 ? "+" + number(value, digits, unit) : number(value, digits, unit).replace("-", "−");
+  return (Number(value?.toFixed(digits)) > 0 ? "+" : "") + number(value, digits, unit);
 }
 
 export function deviation(value, digits, unit = "") {
