@@ -40,7 +40,11 @@ def test_version():
 
 
 @pytest.mark.parametrize(
-    "command", ["run", "replay", "simulate", "inspect", "calibrate", "check-config", "bench"]
+    "command",
+    [
+        *("run", "replay", "simulate", "inspect", "calibrate", "check-config", "bench"),
+        *("monitor", "demo"),
+    ],
 )
 def test_every_command_has_help_with_an_example(command):
     result = call(command, "--help")
@@ -151,7 +155,7 @@ def test_a_bad_log_gives_what_it_holds_or_one_line(tmp_path, command, kind, stat
         assert "3 sensors" in result.stdout
 
 
-@pytest.mark.parametrize("command", ["replay", "inspect"])
+@pytest.mark.parametrize("command", ["replay", "inspect", "monitor"])
 def test_a_log_that_cannot_be_opened_gives_one_line(tmp_path, command):
     assert_one_line(call(command, tmp_path / "none.tlog"), 3, "none.tlog: No such file")
     assert_one_line(call(command, tmp_path), 3, "Is a directory")
@@ -175,6 +179,7 @@ def test_a_log_without_samples_says_what_would_do(tmp_path):
             ["'cricle', expected one of circle, drive1"],
         ),
         (["simulate", "circle", "--seed", 1, "--live", "udp://x:1"], ["'udp://x:1' found"]),
+        (["monitor", "udp://x:1"], ["URL: 'udp://x:1' found, one of"]),
         (["run", "--set", "links=[{name: a, url: x}]"], ["links.0.url: a: 'x' found, one of"]),
         (["check-config", "none.yaml"], ["none.yaml: No such file"]),
     ],
@@ -184,7 +189,13 @@ def test_the_users_mistake_gives_one_line_and_status_2(arguments, parts):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["replay", DRIVE, "--outage", "9:3"], ["simulate", "circle"]]
+    "arguments",
+    [
+        ["replay", DRIVE, "--outage", "9:3"],
+        ["simulate", "circle"],
+        ["monitor", DRIVE, "--listen", "here"],
+        ["demo", "--listen", "127.0.0.1:99999"],
+    ],
 )
 def test_wrong_arguments_give_status_2(arguments):
     assert call(*arguments).exit_code == 2

@@ -153,6 +153,24 @@ def test_what_comes_in_parts_is_one_event(text):
     assert (event.severity, event.text, event.system) == (4, text, 1)
 
 
+def test_a_part_that_is_lost_or_comes_twice_spoils_no_other_text():
+    def heard(*parts: int) -> list[str]:
+        for part in parts:
+            told(
+                vehicles,
+                "STATUSTEXT",
+                text=b"%d" % part * (50 if part < 2 else 9),
+                id=4,
+                chunk_seq=part,
+            )
+        return [event.text for event in vehicles.events]
+
+    vehicles, whole = Vehicles(), "0" * 50 + "1" * 50 + "2" * 9
+    assert heard(0, 2, 1, 1, 2) == []
+    assert heard(0, 1, 2) == [whole]
+    assert heard(0, 0, 1, 1, 2) == [whole, whole]
+
+
 @given(st.lists(st.sampled_from(["next", "lost", "late"]), max_size=80), st.integers(1, 7))
 def test_losses_are_what_did_not_come(steps, cut):
     sent, came, held = 250, [250 % 256], None

@@ -58,9 +58,7 @@ async def monitor(source: str):
 async def browsing(url: str, viewport=DESK, scheme="light"):
     """The page in a browser; nothing may go wrong there, or come from elsewhere."""
     async with async_playwright() as playwright:
-        browser = await playwright.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox"] * (os.getuid() == 0)
-        )
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = await browser.new_page(viewport=viewport, color_scheme=scheme)
         page.set_default_timeout(SAFETY_S * 1000)
         errors, asked = [], []

@@ -9,7 +9,7 @@ import numpy as np
 from risaf_link.links import Link
 from risaf_link.mavlink.frame import FrameParser
 from risaf_link.monitor.asking import Asking
-from risaf_link.monitor.recording import Playback, Player
+from risaf_link.monitor.recording import Player
 from risaf_link.monitor.vehicles import Vehicles
 
 TICK_S = 0.05
@@ -110,6 +110,3 @@ class Log:
             now_s = loop.time()
             self.player.advance(now_s - last_s)
             last_s = now_s
-
-
-__all__ = ["Live", "Log", "Playback", "Source"]

@@ -116,15 +116,17 @@ class Vehicles:
         severity, text, number, part = _STATUSTEXT(frame.payload)
         text = text.partition(b"\0")[0]
         if number:
-            parts = self._texts.setdefault((frame.system, frame.component, number), [])
-            if part != len(parts):  # one was lost, or came twice
+            key = frame.system, frame.component, number
+            parts = self._texts.pop(key, []) if part else []
+            if part > len(parts):  # one was lost
                 return
-            parts.append(text)
+            parts[part:] = [text]  # it may come twice
             if len(text) == TEXT_BYTES:
+                self._texts[key] = parts
                 if len(self._texts) > MOST_TEXTS:
                     del self._texts[next(iter(self._texts))]
                 return
-            text = b"".join(self._texts.pop((frame.system, frame.component, number)))
+            text = b"".join(parts)
         words = text.decode("utf-8", "replace")
         self.events.append(Event(time_us, frame.system, frame.component, severity, words))
         self.event_count += 1

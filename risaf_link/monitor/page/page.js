@@ -119,6 +119,7 @@ function showArray(known) {
 }
 
 function showHeard(update) {
+  update.heard.forEach((h, i) => { if ($("heard").rows[i]) $("heard").rows[i].title = `${number(h.bytes_per_s / 1000, 1)} kB/s`; });
   fill($("heard"), update.heard.map((h) => [
     words.who(h).join(" · "),
     number(h.frames_per_s, 1),
