@@ -136,7 +136,7 @@ export class Timeline {
     c.textAlign = "center";
     c.textBaseline = "top";
     const seconds = (view.toUs - view.fromUs) / 1e6;
-    const stepUs = 1e6 * TIME_STEPS.find((s) => s >= seconds / (width / 110));
+    const stepUs = 1e6 * (TIME_STEPS.find((s) => s >= seconds / (width / 80)) ?? 600);
     for (let us = Math.ceil((view.fromUs - view.zeroUs) / stepUs) * stepUs + view.zeroUs; us <= view.toUs; us += stepUs) {
       if (x(us) > MARGIN.left + 14 && x(us) < width - 24) c.fillText(view.timeText(us), x(us), height - MARGIN.bottom + 5);
     }
