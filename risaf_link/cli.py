@@ -348,8 +348,9 @@ def simulate(
 def monitor(source: str, listen: tuple[str, int]) -> None:
     """Show vehicles on a page in the browser: live from a link, or from a log.
 
-    A URL is one of those that `run` takes. The page finds the risaf_link components there and asks
-    them for what it shows; nothing else is sent. Needs the extra `monitor`.
+    A URL is one of those that `run` takes. The page finds the risaf_link components there, asks
+    them for what it shows, and everybody for the time; nothing else is sent. Needs the extra
+    `monitor`.
 
     \b
     risaf-link monitor udpin://0.0.0.0:14550

@@ -73,6 +73,7 @@ def test_the_kernel_s_filter_is_that_of_the_python_form(seed):
         std = np.sqrt(python.angle_covariance.diagonal())
         apart = (python.angle_covariance - native.angle_covariance) / np.outer(std, std)
         assert np.abs(apart).max() < 1e-9
+        assert native.bias_std == pytest.approx(python.bias_std, rel=1e-9)
     deviation = np.sqrt(filters[0].covariance.diagonal())
     difference = (filters[0].covariance - filters[1].covariance) / np.outer(deviation, deviation)
     assert np.abs(difference).max() < 1e-11

@@ -14,9 +14,12 @@ from pathlib import Path
 
 import pytest
 from playwright.async_api import Page, async_playwright, expect
+from test_monitor import NOW_US, STATUS
+from wire import frame
 
 from risaf_link.links import open_link
 from risaf_link.links.play import play
+from risaf_link.mavlink.tlog import record
 from risaf_link.sim.failures import Dropouts
 from risaf_link.sim.scenario import scenario
 from risaf_link.sim.stream import frames
@@ -196,3 +199,19 @@ async def test_it_fits_a_phone_and_follows_its_colours(log, scheme):
         red, *_ = map(int, re.findall(r"\d+", ground))
         assert (red > 128) == (scheme == "light")
         await kept_screenshot(page, f"phone-{scheme}")
+
+
+async def test_of_several_vehicles_one_is_chosen(tmp_path):
+    log, records = tmp_path / "two.tlog", []
+    for second in range(30):
+        for system, yaw in ((1, 0.5), (2, 1.0)):
+            told = {**STATUS, "yaw": yaw, "fused_count": second}
+            raw = frame("GPS_HEADING_STATUS", (system, 191), **told).raw
+            records.append(record(NOW_US + second * 1_000_000, raw))
+    log.write_bytes(b"".join(records))
+    async with monitor(str(log)) as (_, url), browsing(url) as page:
+        await until(page, "#yaw", "^28.6°$")
+        await page.select_option("#chosen", "2:191")
+        await until(page, "#yaw", "^57.3°$")
+        await page.select_option("#chosen", "1:191")
+        await until(page, "#yaw", "^28.6°$")
