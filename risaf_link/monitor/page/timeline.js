@@ -6,7 +6,7 @@ const MARGIN = { left: 46, right: 8, top: 8, bottom: 20 };
 const GAP_S = 1.5; // between two rows: the line is broken
 const STEPS = [1, 2, 5, 10];
 const TURN_STEPS = [5, 10, 15, 30, 45, 90]; // deg
-const OUTLIERS = 0.02; // share at either end that does not set the range
+const OUTLIERS = 0.02; // share of dots and bands, at either end, that does not set the range
 const TIME_STEPS = [5, 10, 15, 30, 60, 120, 300];
 
 function niceStep(range, count) {
@@ -82,12 +82,13 @@ export class Timeline {
   }
 
   #range(rows) {
-    const lows = [], highs = [];
-    for (const { band, shown } of this.lines) {
+    const lows = [], highs = [], inside = this.marks.map(({ level }) => level);
+    for (const { band, dots, shown } of this.lines) {
       for (const row of rows) {
         const v = shown(row);
         if (v === null) continue;
         const half = band ? Math.min(band(row) ?? 0, this.wraps / 2 || Infinity) : 0;
+        if (!dots) inside.push(v);
         lows.push(v - half);
         highs.push(v + half);
       }
@@ -95,8 +96,7 @@ export class Timeline {
     lows.sort((a, b) => b - a);
     highs.sort((a, b) => a - b);
     const last = Math.floor((lows.length - 1) * (1 - OUTLIERS));
-    const levels = this.marks.map(({ level }) => level);
-    let low = Math.min(lows[last] ?? Infinity, ...levels), high = Math.max(highs[last] ?? -Infinity, ...levels);
+    let low = Math.min(lows[last] ?? Infinity, ...inside), high = Math.max(highs[last] ?? -Infinity, ...inside);
     if (low > high) [low, high] = [0, 0];
     if (this.from !== null) low = this.from;
     const room = Math.max(high - low, this.least), middle = (low + high) / 2;
