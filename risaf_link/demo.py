@@ -1,9 +1,12 @@
 """A demonstration without hardware: a simulated vehicle, the service, and the page.
 
-Vehicle and service are processes of their own, the same commands that a person would type.
+Vehicle and service are processes of their own, the same commands that a person would type; so is
+a broker, where mosquitto is installed.
 """
 
 import asyncio
+import os
+import shutil
 import socket
 import sys
 from asyncio.subprocess import Process
@@ -17,6 +20,7 @@ from risaf_link.monitor.server import serve
 from risaf_link.monitor.source import Live
 
 HOST = "127.0.0.1"
+NAME = "demo"  # of the vehicle, at the broker
 GROUND_PORT = 14550  # where ground stations listen
 END_S = 5.0  # in which a process that was asked to end must do so
 GRACE_S = 0.5  # in which we hear of Ctrl-C ourselves, after a process that it ended
@@ -43,29 +47,41 @@ async def demo(
     RisafError
         If one of the processes fails.
     """
-    vehicle_port, page_port = _free_ports(2)
+    (vehicle_port, page_port), (broker_port,) = _free_ports(2), _free_ports(1, socket.SOCK_STREAM)
+    broker = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
     links = (
         f"{{name: vehicle, url: 'udpin://{HOST}:{vehicle_port}', emit: {{}}}}",
         f"{{name: page, url: 'udpin://{HOST}:{page_port}'}}",
         f"{{name: ground, url: 'udpout://{HOST}:{GROUND_PORT}'}}",
     )
-    commands = {
-        "service": ("run", "--set", f"links=[{', '.join(links)}]"),
+    mqtt = ("--set", f"mqtt.url=mqtt://{HOST}:{broker_port}", "--set", f"mqtt.vehicle={NAME}")
+    ours = sys.executable, "-m", "risaf_link.cli"
+    commands: dict[str, tuple[str, ...]] = {
+        **({"broker": (broker, "-p", str(broker_port))} if broker else {}),
+        "service": (
+            *ours,
+            "run",
+            "--set",
+            f"links=[{', '.join(links)}]",
+            *(mqtt if broker else ()),
+        ),
         "vehicle": (
-            *("simulate", "demo", "--seed", str(seed)),
+            *(*ours, "simulate", "demo", "--seed", str(seed)),
             *("--live", f"udpout://{HOST}:{vehicle_port}"),
         ),
     }
     url = f"udpout://{HOST}:{page_port}"
     async with AsyncExitStack() as started:
         processes = {
-            name: await started.enter_async_context(_running(*command))
+            name: await started.enter_async_context(_running(*command, quiet=name == "broker"))
             for name, command in commands.items()
         }
         tell("service  risaf-link run")
         tell("vehicle  simulated: 120 gyros, shocked at times; some fall silent and come back;")
         tell("         40 s of every 2 minutes without GPS")
         tell(f"MAVLink  any ground station on UDP port {GROUND_PORT} sees it as well")
+        if broker:
+            tell(f"MQTT     mosquitto_sub -p {broker_port} -v -t 'risaf/{NAME}/#'")
 
         def tell_page(page: str) -> None:
             tell(f"page     {page}")
@@ -91,16 +107,17 @@ async def _until_one_ends(
         for task in tasks:
             task.cancel()
         await asyncio.wait(tasks)
-    if status or name == "service":
+    if status or name != "vehicle":
         raise RisafError(f"the {name} ended with status {status}")
     tell("The drive is over.")
 
 
 @asynccontextmanager
-async def _running(*arguments: str) -> AsyncIterator[Process]:
-    """Run one of our commands as a process, which ends with the block."""
+async def _running(*command: str, quiet: bool = False) -> AsyncIterator[Process]:
+    """Run a command as a process, which ends with the block."""
+    nowhere = asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "risaf_link.cli", *arguments, stdin=asyncio.subprocess.DEVNULL
+        *command, stdin=nowhere, stderr=nowhere if quiet else None
     )
     try:
         yield process
@@ -115,9 +132,9 @@ async def _running(*arguments: str) -> AsyncIterator[Process]:
             await process.wait()
 
 
-def _free_ports(count: int) -> list[int]:
-    """UDP ports that nobody uses now."""
-    with_ports = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+def _free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
+    """Ports that nobody uses now."""
+    with_ports = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
     try:
         for each in with_ports:
             each.bind((HOST, 0))

@@ -30,7 +30,7 @@ def test_the_demo_shows_a_vehicle_and_ends_with_all_its_processes():
                 lines.append(process.stderr.readline())
             url = re.search(r"http://\S+", "".join(lines))[0]
             started = children(process.pid)
-            assert len(started) == 2
+            assert len(started) == 2 + ("MQTT" in "".join(lines))
             with urlopen(f"{url}/updates", timeout=SAFETY_S) as updates:  # noqa: S310
                 for line in updates:
                     update = json.loads(line.removeprefix(b"data: ")) if line.strip() else {}
