@@ -175,7 +175,6 @@ class Pipeline:
             track,
             self._monitor.advance(elapsed, track.aligned),
             partial(self._array_status, sensors),
-            self._estimator.bias_std,
         )
 
     def _set_delay(self, delay: float) -> None:

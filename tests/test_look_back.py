@@ -345,7 +345,8 @@ def test_the_share_of_errors_within_what_is_stated_is_counted(drive):
 def test_the_deviation_of_the_bias_starts_as_configured_and_shrinks(without_truth):
     for form in ("eskf", "paper"):
         config = load(None, [f"attitude.filter={form}", "attitude.initial_bias_std=0.02"])
-        std = [b.bias_std() for b in Replay(config, without_truth, Selection()).blocks()]
+        blocks = Replay(config, without_truth, Selection()).blocks()
+        std = [estimate.attitude.bias_std for block in blocks for estimate in block]
         assert std[0] == pytest.approx(np.full(3, 0.02), rel=0.05)
         assert std[-1][2] < 0.5 * std[0][2]
 

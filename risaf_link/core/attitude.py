@@ -152,12 +152,6 @@ class PaperFilter:
         self._waiting = 0.0  # s, for a rate
         self._yaws = YawHistory()
 
-    @property
-    def bias_std(self) -> Floats:
-        """Standard deviation of the bias, (3,), rad/s."""
-        std: Floats = np.sqrt(np.diag(self._covariance)[BIAS])
-        return std
-
     def configure(self, parameters: AttitudeParameters) -> None:
         """Take new parameters; the state stays, and with it what they say of the start."""
         self._parameters = parameters

@@ -79,7 +79,6 @@ class EstimateBlock(Struct, frozen=True):
     track: Track
     heading: HeadingTrack
     array: Callable[[], ArrayStatus]  # as of now
-    bias_std: Callable[[], Floats]  # as of now; (3,) rad/s, standard deviation of the bias
 
     def __len__(self) -> int:
         return len(self.time_us)

@@ -92,12 +92,6 @@ class Estimator:
             self._filter.configure(attitude, heading)
         self._guard.configure(heading)
 
-    def bias_std(self) -> Floats:
-        """Standard deviation of the fused rate's bias, as of now, (3,), rad/s."""
-        if isinstance(self._filter, PaperFilter):
-            return self._filter.bias_std
-        return np.sqrt(np.diag(self._filter.covariance)[BIAS_AXES])
-
     def set_bias(self, rate_b: Floats, variance: Floats) -> None:
         """Believe the mean rate of a vehicle that rests, whatever the bias was held to be.
 

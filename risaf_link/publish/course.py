@@ -158,7 +158,7 @@ class Course:
             self._note_innovation(float(block.elapsed[0]), heading, innovation)
         looked = self._looks.estimate if self._looks.look(block) else None
         if looked is not None:
-            self._note_array(looked.array, looked.elapsed, block.bias_std())
+            self._note_array(looked.array, looked.elapsed, looked.attitude.bias_std)
         self._note_events(self._events.take(block, looked))
         if self._waiting >= GATHERED:
             self._condense()

@@ -183,7 +183,7 @@ class McapWriter:
     def _write_look(self, block: EstimateBlock, looked: Estimate) -> None:
         when = _when(block, len(block) - 1)
         names = *(f"bias_{axis}" for axis in AXES), *(f"bias_std_{axis}" for axis in AXES)
-        biases = *looked.attitude.bias_b.tolist(), *block.bias_std().tolist()
+        biases = *looked.attitude.bias_b.tolist(), *looked.attitude.bias_std.tolist()
         stamp = {"time_us": looked.time_us}
         self._write("/bias", *when, stamp | _known(names, biases))
         heading = looked.heading
