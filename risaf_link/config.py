@@ -17,7 +17,7 @@ from msgspec import Meta, Struct, field, inspect
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.tunable import Tunable
 from risaf_link.errors import ConfigError, LinkError
-from risaf_link.links import open_link
+from risaf_link.links import RecordingParameters, open_link
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.odometry import ProfileName
@@ -55,6 +55,7 @@ class LinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
     emit: Rates | None = None  # None: the default set
     request: RequestedRates | None = None  # None: what is needed, where an autopilot is heard
     signing: SigningParameters | None = None  # None: nothing is signed or verified
+    recording: RecordingParameters | None = None  # None: the defaults
 
 
 class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
@@ -165,6 +166,11 @@ def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
             raise ConfigError(f"{where}links.{i}.url: {error}") from None
         if link.signing:
             _check_signing(f"{where}links.{i}.signing", link)
+        if link.recording and not link.url.startswith("tlog:"):
+            raise ConfigError(
+                f"{where}links.{i}.recording: found it of a link with peers, expected it of a "
+                "recording"
+            )
 
 
 def _check_feeding(where: str, config: Config) -> None:

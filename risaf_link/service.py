@@ -112,7 +112,9 @@ class Service:
     ) -> None:
         parameters = Parameters(config, kept.values, kept.overruled)
         self.pipeline = Pipeline(parameters.tuned, config.own, load_calibration(config))
-        self.links = [open_link(link.url, link.name, clock_us) for link in config.links]
+        self.links = [
+            open_link(link.url, link.name, clock_us, link.recording) for link in config.links
+        ]
         self._clock_us = clock_us
         self._kept = kept
         self._storing: set[asyncio.Task[None]] = set()
@@ -240,10 +242,10 @@ class Service:
         """Record what was taken, but for keys."""
         if not self._recordings:
             return
-        for row in np.flatnonzero(table.cuts["message_id"] != SETUP_SIGNING).tolist():
-            raw = table.frame(row).raw
-            for recording in self._recordings:
-                recording.record(received_us, raw)
+        rows = np.flatnonzero(table.cuts["message_id"] != SETUP_SIGNING).tolist()
+        frames = [table.frame(row).raw for row in rows]
+        for recording in self._recordings:
+            recording.record(received_us, *frames)
 
     def _send(self, blocks: list[EstimateBlock]) -> None:
         for block in blocks:

@@ -9,6 +9,7 @@ import yaml
 
 from risaf_link.config import Config, dump, load, load_calibration
 from risaf_link.errors import ConfigError
+from risaf_link.links import RecordingParameters
 from risaf_link.publish.access import PASSWORD, MqttParameters, address, broker_of
 
 EXAMPLE = Path(__file__).parents[1] / "config" / "risaf_link.yaml"
@@ -37,6 +38,13 @@ def test_the_example_holds_every_key_with_its_default():
 def test_the_example_says_of_every_key_why():
     lines = [line for line in EXAMPLE.read_text().splitlines() if re.match(r" +\w+: ", line)]
     assert all("#" in line for line in lines if line.split(":")[0].strip() not in Config().emit)
+
+
+def test_what_the_example_says_of_recordings_are_the_defaults():
+    block = EXAMPLE.read_text().partition("#   recording:\n")[2].partition("\n\n")[0]
+    lines = [line.partition("#     ")[2] for line in block.splitlines()]
+    told = yaml.safe_load("\n".join(lines))
+    assert told == msgspec.to_builtins(RecordingParameters())
 
 
 def test_what_is_dumped_loads_again(tmp_path):
@@ -95,6 +103,18 @@ def test_settings_go_over_the_file(tmp_path):
         (
             "links: [{name: a, url: 'udpin://x:1'}, {name: a, url: 'udpin://x:2'}]",
             "links.1.name: found 'a' twice, expected once",
+        ),
+        (
+            "links: [{name: a, url: 'udpin://x:1', recording: {}}]",
+            "links.0.recording: found it of a link with peers, expected it of a recording",
+        ),
+        (
+            "links: [{name: a, url: 'tlog:///a.tlog', recording: {segment_bytes: 10}}]",
+            "links.0.recording.segment_bytes: found 10, expected int >= 1000000",
+        ),
+        (
+            "links: [{name: a, url: 'tlog:///a.tlog', recording: {most: 1}}]",
+            "links.0.recording.most: unknown key; known: segment_bytes, segment_s, most_bytes, ",
         ),
         (
             "fusion: {alpha: 0.9}\nfusion: {alpha: 0.8}",

@@ -9,7 +9,7 @@ from risaf_link.links.link import Link, LinkCounts, Receive
 from risaf_link.links.memory import MemoryLink
 from risaf_link.links.serial import SerialLink
 from risaf_link.links.tcp import TcpInLink, TcpOutLink
-from risaf_link.links.tlog import TlogLink
+from risaf_link.links.tlog import RecordingParameters, TlogLink
 from risaf_link.links.udp import UdpInLink, UdpOutLink
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "LinkCounts",
     "MemoryLink",
     "Receive",
+    "RecordingParameters",
     "SerialLink",
     "TcpInLink",
     "TcpOutLink",
@@ -45,7 +46,12 @@ _NETWORK: dict[str, Callable[[str, str, int], Link]] = {
 }
 
 
-def open_link(url: str, name: str, clock_us: Callable[[], int]) -> Link:
+def open_link(
+    url: str,
+    name: str,
+    clock_us: Callable[[], int],
+    recording: RecordingParameters | None = None,
+) -> Link:
     """Make the link that a URL describes; its `run` opens it.
 
     Parameters
@@ -57,6 +63,8 @@ def open_link(url: str, name: str, clock_us: Callable[[], int]) -> Link:
         What the log calls it.
     clock_us : Callable
         Microseconds since 1970, for recordings.
+    recording : RecordingParameters, optional
+        The limits of one, if they are not the defaults.
 
     Raises
     ------
@@ -72,7 +80,7 @@ def open_link(url: str, name: str, clock_us: Callable[[], int]) -> Link:
     if found is None:
         raise LinkError(f"{name}: {url!r} found, {form} expected")
     if kind == "tlog":
-        return TlogLink(name, Path(rest), clock_us)
+        return TlogLink(name, Path(rest), clock_us, limits=recording or RecordingParameters())
     if kind == "memory":
         return MemoryLink(name, rest)
     place, number = found[1], int(found[2])

@@ -1,52 +1,102 @@
 """A recording of what was received and sent, as a ground station writes it."""
 
 import asyncio
-import contextlib
-import io
-import itertools
+import fcntl
+import json
+import logging
 import os
-import threading
-from collections.abc import Callable
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import IO, Annotated, Any
 
+from msgspec import Meta, Struct, structs
+
+from risaf_link.links import recorder
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link, Receive
 from risaf_link.mavlink.tlog import RECEIVED, SENT, record
 
-MOST_WAITING = 65536  # records
 FLUSH_S = 1.0
+LEAVE_S = 5.0  # that the end waits for the recorder: a network disk may hang for ever
+TELL_LOST_S = 60.0  # from one line on lost records to the next
+MOST_EARLY = 65536  # records that wait for the pipe
+ROOM = select.PIPE_BUF - recorder.HEAD.size  # bytes of records that go into a pipe whole or not
+
+_log = logging.getLogger(__name__)
 
 
-def _append(file: io.FileIO, data: bytes) -> None:
-    """Write all of it or, if that fails, nothing: half a record would spoil what follows."""
-    end = file.seek(0, os.SEEK_END)
-    rest = memoryview(data)
-    try:
-        while rest:
-            rest = rest[file.write(rest) :]
-        os.fdatasync(file.fileno())  # vehicles are switched off, not shut down
-    except OSError:
-        file.truncate(end)
-        raise
+class RecordingParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """How a recording is cut into files, and what it may take of the disk."""
+
+    segment_bytes: Annotated[int, Meta(ge=1_000_000)] = 256_000_000
+    segment_s: Annotated[float, Meta(ge=1.0)] = 3600.0
+    most_bytes: Annotated[int, Meta(ge=4_000_000)] | None = None  # None: no limit
+    least_free_bytes: Annotated[int, Meta(ge=0)] = 512_000_000
+
+
+DEFAULTS = RecordingParameters()
+
+
+class Pipe:
+    """Records on their way to the recorder: they outlive both sides of it.
+
+    What is written goes in whole or not at all, and what is read is all there is.
+    """
+
+    def __init__(self) -> None:
+        self.out, self._in = os.pipe()
+        with suppress(OSError):  # if many pipes are open the system allows us less
+            fcntl.fcntl(self._in, fcntl.F_SETPIPE_SZ, recorder.PIPE_BYTES)
+        os.set_blocking(self._in, False)
+
+    def put(self, records: bytes, count: int) -> bool:
+        """Write records of no more than `ROOM` together; False: there is no room."""
+        try:
+            os.write(self._in, recorder.HEAD.pack(recorder.MARK, len(records), count) + records)
+        except BlockingIOError:
+            return False
+        return True
+
+    def take(self) -> list[recorder.Message]:
+        """Read what the recorder has not."""
+        ready, _, _ = select.select([self.out], [], [], 0)
+        return recorder.cut(os.read(self.out, recorder.PIPE_BYTES))[0] if ready else []
+
+    def end(self) -> None:
+        """Say that nothing will come any more."""
+        os.close(self._in)
+        self._in = -1
+
+    def close(self) -> None:
+        """Close both sides."""
+        os.close(self.out)
+        if self._in >= 0:
+            self.end()
 
 
 class TlogLink(Link):
     """A recording. Nothing is ever received from it.
 
-    Records wait in memory from the first on, and a thread writes them each second: a memory card
-    can take longer over a write than a serial port's buffer lasts.
+    Records go through a pipe to a process of its own, which writes them: a disk that takes its
+    time holds nobody up, and what was handed over is written though the service be killed.
 
     Parameters
     ----------
     name : str
         What the log calls it.
     path : Path
-        The file. One that exists is kept: NAME.1.tlog, NAME.2.tlog ... are taken instead.
+        The first file. One that exists is kept: NAME.1.tlog, NAME.2.tlog ... follow.
     clock_us : Callable
         Microseconds since 1970.
     backoff : Backoff
-        How long it waits before it tries the file again.
+        How long it waits before it starts a recorder again that died.
     flush_s : float
-        How often it writes.
+        How often what was written is made durable, and after trouble tried again.
+    limits : RecordingParameters
 
     Attributes
     ----------
@@ -61,69 +111,177 @@ class TlogLink(Link):
         clock_us: Callable[[], int],
         backoff: Backoff = BACKOFF,
         flush_s: float = FLUSH_S,
+        limits: RecordingParameters = DEFAULTS,
     ) -> None:
         super().__init__(name, backoff)
         self.path = path
         self._clock_us = clock_us
-        self._flush_s = flush_s
-        self._made = False
-        self._waiting: list[bytes] = []  # the loop's thread appends, the writing one removes
-        self._writing = threading.Lock()
+        self._options = structs.asdict(limits) | {
+            "path": str(path),
+            "most_bytes": limits.most_bytes or 0,
+            "flush_s": flush_s,
+            "retry_s": flush_s,
+        }
+        self._pipe: Pipe | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._early: list[recorder.Message] = []  # before there is a pipe
+        self._handed = self._written = 0  # records that the recorder was given, and told of
+        self._bytes = 0  # that it told of
+        self._failure: str | None = None  # that it told of; None: nothing yet
+        self._told_lost = 0
+        self._next_telling_s = 0.0
 
-    def record(self, received_us: int, raw: bytes) -> None:
-        """Record a frame that was received."""
-        self._put(received_us, RECEIVED, raw)
+    def record(self, received_us: int, *frames: bytes) -> None:
+        """Record frames that were received."""
+        self._put([record(received_us, raw, RECEIVED) for raw in frames])
 
     def send(self, data: bytes) -> None:
         """Record a frame that we send."""
-        self._put(self._clock_us(), SENT, data)
+        self._put([record(self._clock_us(), data, SENT)])
 
-    def _put(self, time_us: int, link: int, raw: bytes) -> None:
-        if len(self._waiting) == MOST_WAITING:
-            self.counts.dropped_out += 1
-        else:
-            self._waiting.append(record(time_us, raw, link))
+    def _put(self, records: Sequence[bytes]) -> None:
+        """Hand records over, or count them."""
+        for data, count in _messages(records):
+            if self._pipe is not None:
+                taken = self._pipe.put(data, count)
+            else:
+                taken = self._handed + count <= MOST_EARLY
+                if taken:
+                    self._early.append((data, count))
+            if taken:
+                self._handed += count
+            else:
+                self.counts.dropped_out += count
+                self._tell_lost()
 
     async def run(self, receive: Receive) -> None:
-        """Write what was and will be recorded until cancelled; trouble with the file is retried."""
+        """Record until cancelled; trouble with the disk or the recorder is retried."""
         try:
             await super().run(receive)
         finally:
-            self.counts.dropped_out += len(self._waiting)
-            self._waiting.clear()
+            self.counts.dropped_out += self._handed - self._written
+            self._handed = self._written = 0
+            self._early.clear()
+            if self._pipe is not None:
+                self._pipe.close()
+                self._pipe = None
+            self._tell_lost(at_once=True)
 
     async def _hold(self, connection: Connection) -> None:
-        with self._open() as file:
+        if self._pipe is None:
+            self._pipe, early, self._early = Pipe(), self._early, []
+            self._refill(early)
+        process, lines = self._start(self._pipe)
+        try:
+            await self._listen(lines, connection)
+            status = process.wait()  # it has closed all its files: that is its very end
+            self._refill(self._pipe.take())
+            raise ChildProcessError(f"the recorder has ended with status {status}")
+        except asyncio.CancelledError:
+            self._pipe.end()
             try:
-                await asyncio.to_thread(self._write, file)
-                connection.up(str(self.path))
-                while True:
-                    await asyncio.sleep(self._flush_s)
-                    await asyncio.to_thread(self._write, file)
-            except asyncio.CancelledError:
-                with contextlib.suppress(OSError):
-                    self._write(file)
-                raise
+                async with asyncio.timeout(LEAVE_S):
+                    await self._listen(lines, connection)
+                process.wait()
+            except TimeoutError:
+                _log.warning("%s: the disk hangs: the recorder goes on alone", self.name)
+            raise
+        finally:
+            self._process = None
+            asyncio.get_running_loop().remove_reader(_stdout(process))
+            _stdout(process).close()
 
-    def _open(self) -> io.FileIO:
-        """Make the file under the first name that is free; once made it is gone on with."""
-        if self._made:
-            return io.FileIO(self.path, "a")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        path = self.path
-        for number in itertools.count(1):
-            if not path.exists():
-                break
-            path = self.path.with_stem(f"{self.path.stem}.{number}")
-        file = io.FileIO(path, "x")
-        self.path, self._made = path, True
-        return file
+    def _start(self, pipe: Pipe) -> tuple[subprocess.Popen[bytes], asyncio.StreamReader]:
+        """Start a recorder; the lines that it tells.
 
-    def _write(self, file: io.FileIO) -> None:
-        """Write what waits; if that fails it goes on waiting."""
-        with self._writing:
-            count = len(self._waiting)
-            data = b"".join(self._waiting[:count])
-            _append(file, data)
-            del self._waiting[:count]
-            self.counts.bytes_out += len(data)
+        It must be there before anything is received, so this waits the millisecond that it takes.
+        """
+        command = [sys.executable, "-I", "-S", recorder.__file__, json.dumps(self._options)]
+        self._process = process = subprocess.Popen(  # noqa: S603
+            command,
+            stdin=pipe.out,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            cwd="/",
+            start_new_session=True,
+        )
+        self._bytes, self._failure = 0, None
+        told, lines = _stdout(process), asyncio.StreamReader()
+
+        def read() -> None:
+            data = os.read(told.fileno(), select.PIPE_BUF)
+            if data:
+                lines.feed_data(data)
+            else:
+                lines.feed_eof()
+                loop.remove_reader(told)
+
+        loop = asyncio.get_running_loop()
+        loop.add_reader(told, read)
+        return process, lines
+
+    def _refill(self, left: list[recorder.Message]) -> None:
+        """Put into the pipe what no recorder has taken; all else that is not written is lost."""
+        self.counts.dropped_out += self._handed - self._written - sum(n for _, n in left)
+        self._handed = self._written = 0
+        for data, count in left:
+            if self._pipe is not None and self._pipe.put(data, count):
+                self._handed += count
+            else:
+                self.counts.dropped_out += count
+
+    async def _listen(self, lines: asyncio.StreamReader, connection: Connection) -> None:
+        """Take what the recorder tells, to its end."""
+        async for line in lines:
+            try:
+                told = json.loads(line)
+            except ValueError:  # it dies, and says why
+                _log.warning("%s: %s", self.name, line.decode(errors="replace").rstrip())
+                continue
+            if "deleted" in told:
+                _log.info("%s: deleted %s: %s", self.name, told["deleted"], told["why"])
+            else:
+                self._note(told, connection)
+
+    def _note(self, state: dict[str, Any], connection: Connection) -> None:
+        """Take what the recorder says of itself."""
+        self.counts.bytes_out += state["bytes"] - self._bytes
+        self._bytes, self._written = state["bytes"], state["records"]
+        failure, path = state["failure"], Path(state["path"] or self.path)
+        if failure and failure != self._failure:
+            _log.warning("%s: down: %s", self.name, failure)
+        elif not failure and (self._failure is None or self._failure):
+            connection.up(str(path))
+        elif path != self.path:
+            _log.info("%s: goes on in %s", self.name, path)
+        self.path, self._failure = path, failure
+        self._tell_lost()
+
+    def _tell_lost(self, at_once: bool = False) -> None:
+        """Say how many records are lost, if there are more, but not all the time."""
+        if self.counts.dropped_out == self._told_lost:
+            return
+        now_s = time.monotonic()
+        if at_once or now_s >= self._next_telling_s:
+            self._next_telling_s = now_s + TELL_LOST_S
+            self._told_lost = self.counts.dropped_out
+            _log.warning("%s: %d records lost so far", self.name, self._told_lost)
+
+
+def _messages(records: Sequence[bytes]) -> Iterator[recorder.Message]:
+    """Put records together that go into the pipe at once."""
+    part: list[bytes] = []
+    size = 0
+    for one in records:
+        if part and size + len(one) > ROOM:
+            yield b"".join(part), len(part)
+            part, size = [], 0
+        part.append(one)
+        size += len(one)
+    if part:
+        yield b"".join(part), len(part)
+
+
+def _stdout(process: subprocess.Popen[bytes]) -> IO[bytes]:
+    assert process.stdout is not None  # noqa: S101 it is a pipe
+    return process.stdout
