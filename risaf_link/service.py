@@ -140,6 +140,8 @@ class Service:
         )
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
+        others = (link for link in self.links if link not in self._recordings)
+        self._first_recorded = [*self._recordings, *others]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
         self._blocks = BlockReader(
             self.pipeline.ingest, self.pipeline.assembler, apart=HEARD, longest=1
@@ -181,7 +183,7 @@ class Service:
         _log.info("started: %s (%s, %s)", names, kernel, loop)
         try:
             async with asyncio.TaskGroup() as tasks:
-                for link in self.links:
+                for link in self._first_recorded:
                     tasks.create_task(link.run(partial(self._receive, link)))
                 for output in self._outputs:
                     tasks.create_task(self._run_output(output))
@@ -260,7 +262,7 @@ class Service:
                         self._leave_out(output)
 
     def _peers(self) -> Iterator[Peer]:
-        return ((link.name, peer) for link in self.links for peer in link.peers)
+        return ((link.name, peer) for link in self._first_recorded for peer in link.peers)
 
     def _hand_out(self, frames: list[tuple[Peer, bytes]]) -> None:
         for (link, peer), raw in frames:

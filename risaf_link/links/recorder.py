@@ -101,6 +101,7 @@ class Recording:
         self._unsynced: list[Message] = []
         self._others: list[tuple[str, int]] = []  # older segments and their sizes, oldest first
         self._others_bytes = 0
+        self._room = 0  # bytes that may be written
         self._until_s = self._flush_due_s = self._look_due_s = 0.0
         self.path = ""
         self.records = self.bytes = 0
@@ -161,20 +162,21 @@ class Recording:
         """Make the next segment."""
         os.makedirs(self._directory, exist_ok=True)
         found = self._found()
+        self._others = [(path, size) for _, path, size in sorted(found) if size is not None]
+        self._others_bytes = sum(size for _, size in self._others)
+        self._make_room(0)
+        number = max([self._number, *(number for number, *_ in found)], default=-1)
         file = None
         while file is None:
-            self._number = max([self._number, *(number for number, *_ in found)], default=-1) + 1
-            infix = f".{self._number}" if self._number else ""
+            number += 1
+            infix = f".{number}" if number else ""
             path = os.path.join(self._directory, f"{self._stem}{infix}{self._suffix}")
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
             with suppress(FileExistsError):  # somebody was faster
                 file = os.open(path, flags, 0o666)
-        self._file, self.path = file, path
-        self._others = [(path, size) for _, path, size in sorted(found) if size is not None]
-        self._others_bytes = sum(size for _, size in self._others)
+        self._file, self.path, self._number = file, path, number
         self._size = self._synced_size = 0
         self._until_s = self._clock_s() + self._segment_s
-        self._look_due_s = 0.0
         with suppress(OSError):  # some file systems cannot
             folder = os.open(self._directory, os.O_RDONLY)
             try:
@@ -206,11 +208,13 @@ class Recording:
     def _fitting(self, waiting: list[Message]) -> list[Message]:
         """As many as the segment takes."""
         room = min(self._segment_bytes - self._size, MOST_AT_ONCE)
-        for count, (data, _) in enumerate(waiting[:]):
-            room -= len(data)
-            if room < 0:
-                return waiting[: max(count, 1)]
-        return waiting[:]
+        part: list[Message] = []
+        for message in waiting:
+            room -= len(message[0])
+            if part and room < 0:
+                break
+            part.append(message)
+        return part
 
     def _append(self, file: int, part: list[Message], waiting: list[Message]) -> bool:
         """Write all of it or nothing; False: the file may not grow, another one is needed."""
@@ -238,18 +242,20 @@ class Recording:
             if self._others_bytes + self._size + size <= self._most_bytes:
                 break
             self._delete("most_bytes")
-        now_s = self._clock_s()
-        if not self._least_free_bytes or now_s < self._look_due_s:
+        if not self._least_free_bytes:
             return
-        disk = os.statvfs(self._directory)
-        lacking = self._least_free_bytes + size - disk.f_bavail * disk.f_frsize
-        while lacking > 0 and self._others:
-            lacking -= self._delete("least_free_bytes")
-        if lacking > 0:
+        now_s = self._clock_s()
+        if now_s >= self._look_due_s:  # a file system may count late what was deleted
+            disk = os.statvfs(self._directory)
+            self._room = disk.f_bavail * disk.f_frsize - self._least_free_bytes
+            self._look_due_s = now_s + self._flush_s
+        while size > self._room and self._others:
+            self._room += self._delete("least_free_bytes")
+        if size > self._room:
+            self._look_due_s = now_s
             text = f"less than {self._least_free_bytes} bytes are free"
             raise OSError(errno.ENOSPC, text, self._directory)
-        # A file system may take a moment until it counts what was deleted.
-        self._look_due_s = now_s + self._flush_s
+        self._room -= size
 
     def _delete(self, why: str) -> int:
         path, size = self._others[0]
@@ -267,16 +273,18 @@ class Recording:
         if self._unsynced:
             try:
                 os.fdatasync(self._file)  # vehicles are switched off, not shut down
-            except OSError:  # the system has given up what it held: another file gets it
+            except OSError:  # the system has given up what it held
                 waiting[:0] = self._unsynced
                 self.bytes -= sum(len(data) for data, _ in self._unsynced)
                 self.records -= sum(records for _, records in self._unsynced)
+                self._unsynced = []
                 self._cut(self._file, self._synced_size)
-                self.close()
                 raise
             self._synced_size = self._size
             self._unsynced = []
-        if os.fstat(self._file).st_nlink == 0:  # somebody has removed it
+        try:
+            os.stat(self.path)
+        except FileNotFoundError:  # somebody has removed it
             self.close()
 
     def _end(self, waiting: list[Message]) -> None:
@@ -328,17 +336,19 @@ class Inbox:
         hung_up = select.poll()
         hung_up.register(self._pipe, 0)
         rest = b""
-        while True:
-            while self.taken - written() > MOST_WAITING and not hung_up.poll(PAUSE_S * 1000):
-                pass
-            data = os.read(self._pipe, PIPE_BYTES)
-            if not data:
-                break
-            rest = self._take(rest + data)
+        try:
+            while True:
+                while self.taken - written() > MOST_WAITING and not hung_up.poll(PAUSE_S * 1000):
+                    pass
+                data = os.read(self._pipe, PIPE_BYTES)
+                if not data:
+                    break
+                rest = self._take(rest + data)
+                self.more.set()
+                time.sleep(PAUSE_S)
+        finally:
+            self.ended.set()
             self.more.set()
-            time.sleep(PAUSE_S)
-        self.ended.set()
-        self.more.set()
 
     def _take(self, data: bytes) -> bytes:
         """Take whole messages; what is left of the data."""
