@@ -82,7 +82,7 @@ def kill_once(folder: Path, seed: int, most_answers: int = MOST_ANSWERS) -> Outc
         with subprocess.Popen(command) as service:  # noqa: S603
             try:
                 meter.meet()
-                recorder = os.pidfd_open(_child(service.pid))
+                recorder = os.pidfd_open(child(service.pid))
                 sent = _drive(meter, answers)
                 until = time.perf_counter() + pause_s
                 while time.perf_counter() < until:
@@ -186,7 +186,7 @@ def _stamp_ms(raw: bytes) -> int:
     return int.from_bytes(raw[HEAD : HEAD + 4], "little")
 
 
-def _child(parent: int) -> int:
+def child(parent: int) -> int:
     """The one process that a process has started."""
     for process in Path("/proc").iterdir():
         if process.name.isdecimal():

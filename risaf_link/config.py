@@ -166,6 +166,8 @@ def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
             raise ConfigError(f"{where}links.{i}.url: {error}") from None
         if link.signing:
             _check_signing(f"{where}links.{i}.signing", link)
+        if link.url.startswith("tlog:") and link.url in [other.url for other in links[:i]]:
+            raise ConfigError(f"{where}links.{i}.url: found {link.url!r} twice, expected once")
         if link.recording and not link.url.startswith("tlog:"):
             raise ConfigError(
                 f"{where}links.{i}.recording: found it of a link with peers, expected it of a "

@@ -105,6 +105,10 @@ def test_settings_go_over_the_file(tmp_path):
             "links.1.name: found 'a' twice, expected once",
         ),
         (
+            "links: [{name: a, url: 'tlog:///a.tlog'}, {name: b, url: 'tlog:///a.tlog'}]",
+            "links.1.url: found 'tlog:///a.tlog' twice, expected once",
+        ),
+        (
             "links: [{name: a, url: 'udpin://x:1', recording: {}}]",
             "links.0.recording: found it of a link with peers, expected it of a recording",
         ),

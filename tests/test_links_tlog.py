@@ -179,7 +179,7 @@ async def test_a_file_system_with_small_files_gets_more_of_them(tmp_path: Path) 
 async def test_records_that_were_never_written_are_counted_as_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tlog, "MOST_EARLY", 3)
+    monkeypatch.setattr(tlog, "MOST_WAITING", 3)
     (tmp_path / "logs").touch()
     link = TlogLink("recorder", tmp_path / "logs" / "flight.tlog", no_clock)
     for _ in range(5):
@@ -192,10 +192,26 @@ async def test_records_that_were_never_written_are_counted_as_dropped(
     assert "recorder: 6 records lost so far" in caplog.text
 
 
-async def test_a_recorder_that_hangs_holds_nobody_up_and_what_it_cannot_take_is_counted(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+async def test_a_recorder_that_hangs_holds_nobody_up_and_loses_nothing_as_long_as_memory_lasts(
+    tmp_path: Path,
 ) -> None:
-    link = TlogLink("recorder", tmp_path / "flight.tlog", no_clock)
+    link = TlogLink("recorder", tmp_path / "flight.tlog", no_clock, flush_s=SOON_S)
+    frame, count = bytes(250), 6000
+    async with running(link):
+        await stop(link)
+        for n in range(count):
+            link.record(4 * n, frame)
+        os.kill(recorder_of(link), signal.SIGCONT)
+        await until(lambda: link.counts.bytes_out == count * 258)
+    assert times(link.path, 250) == [4 * n for n in range(count)]
+    assert link.counts.dropped_out == 0
+
+
+async def test_what_a_recorder_that_hangs_cannot_take_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tlog, "MOST_WAITING", 100)
+    link = TlogLink("recorder", tmp_path / "flight.tlog", no_clock, flush_s=SOON_S)
     frame, count = bytes(250), 6000
     async with running(link):
         await stop(link)
@@ -203,6 +219,8 @@ async def test_a_recorder_that_hangs_holds_nobody_up_and_what_it_cannot_take_is_
             link.record(4 * n, frame)
         assert "recorder: 1 records lost so far" in caplog.text
         os.kill(recorder_of(link), signal.SIGCONT)
+        dropped = link.counts.dropped_out
+        await until(lambda: link.counts.bytes_out == (count - dropped) * 258)
     kept = times(link.path, 250)
     assert kept == [4 * n for n in range(len(kept))]
     assert len(kept) * 264 >= 0.8 * tlog.recorder.PIPE_BYTES

@@ -9,6 +9,7 @@ import select
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -23,7 +24,7 @@ from risaf_link.mavlink.tlog import RECEIVED, SENT, record
 FLUSH_S = 1.0
 LEAVE_S = 5.0  # that the end waits for the recorder: a network disk may hang for ever
 TELL_LOST_S = 60.0  # from one line on lost records to the next
-MOST_EARLY = 65536  # records that wait for the pipe
+MOST_WAITING = 65536  # records in our memory, while the pipe is full or not there
 ROOM = select.PIPE_BUF - recorder.HEAD.size  # bytes of records that go into a pipe whole or not
 
 _log = logging.getLogger(__name__)
@@ -82,7 +83,8 @@ class TlogLink(Link):
     """A recording. Nothing is ever received from it.
 
     Records go through a pipe to a process of its own, which writes them: a disk that takes its
-    time holds nobody up, and what was handed over is written though the service be killed.
+    time holds nobody up, and what was handed over is written though the service be killed. They
+    wait in memory only before that process has started, and if it takes nothing.
 
     Parameters
     ----------
@@ -124,8 +126,9 @@ class TlogLink(Link):
         }
         self._pipe: Pipe | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._early: list[recorder.Message] = []  # before there is a pipe
-        self._handed = self._written = 0  # records that the recorder was given, and told of
+        self._waiting: deque[recorder.Message] = deque()  # for the pipe
+        self._waiting_records = 0
+        self._handed = self._written = 0  # records that went into the pipe, and were written
         self._bytes = 0  # that it told of
         self._failure: str | None = None  # that it told of; None: nothing yet
         self._told_lost = 0
@@ -140,28 +143,32 @@ class TlogLink(Link):
         self._put([record(self._clock_us(), data, SENT)])
 
     def _put(self, records: Sequence[bytes]) -> None:
-        """Hand records over, or count them."""
-        for data, count in _messages(records):
-            if self._pipe is not None:
-                taken = self._pipe.put(data, count)
-            else:
-                taken = self._handed + count <= MOST_EARLY
-                if taken:
-                    self._early.append((data, count))
-            if taken:
-                self._handed += count
-            else:
+        """Hand records over; what can neither be handed over nor wait is lost and counted."""
+        for message in _messages(records):
+            _, count = message
+            if self._waiting_records + count > MOST_WAITING:
                 self.counts.dropped_out += count
                 self._tell_lost()
+            else:
+                self._waiting.append(message)
+                self._waiting_records += count
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Put into the pipe what waits and goes in."""
+        while self._waiting and self._pipe is not None and self._pipe.put(*self._waiting[0]):
+            _, count = self._waiting.popleft()
+            self._waiting_records -= count
+            self._handed += count
 
     async def run(self, receive: Receive) -> None:
         """Record until cancelled; trouble with the disk or the recorder is retried."""
         try:
             await super().run(receive)
         finally:
-            self.counts.dropped_out += self._handed - self._written
-            self._handed = self._written = 0
-            self._early.clear()
+            self.counts.dropped_out += self._handed - self._written + self._waiting_records
+            self._handed = self._written = self._waiting_records = 0
+            self._waiting.clear()
             if self._pipe is not None:
                 self._pipe.close()
                 self._pipe = None
@@ -169,15 +176,16 @@ class TlogLink(Link):
 
     async def _hold(self, connection: Connection) -> None:
         if self._pipe is None:
-            self._pipe, early, self._early = Pipe(), self._early, []
-            self._refill(early)
+            self._pipe = Pipe()
+            self._hand_over()
         process, lines = self._start(self._pipe)
         try:
             await self._listen(lines, connection)
             status = process.wait()  # it has closed all its files: that is its very end
-            self._refill(self._pipe.take())
+            self._recover(self._pipe.take())
             raise ChildProcessError(f"the recorder has ended with status {status}")
         except asyncio.CancelledError:
+            self._hand_over()
             self._pipe.end()
             try:
                 async with asyncio.timeout(LEAVE_S):
@@ -220,15 +228,14 @@ class TlogLink(Link):
         loop.add_reader(told, read)
         return process, lines
 
-    def _refill(self, left: list[recorder.Message]) -> None:
-        """Put into the pipe what no recorder has taken; all else that is not written is lost."""
-        self.counts.dropped_out += self._handed - self._written - sum(n for _, n in left)
+    def _recover(self, left: list[recorder.Message]) -> None:
+        """Keep for the next recorder what this one has not taken; count what it took with it."""
+        count = sum(count for _, count in left)
+        self.counts.dropped_out += self._handed - self._written - count
         self._handed = self._written = 0
-        for data, count in left:
-            if self._pipe is not None and self._pipe.put(data, count):
-                self._handed += count
-            else:
-                self.counts.dropped_out += count
+        self._waiting.extendleft(reversed(left))
+        self._waiting_records += count
+        self._hand_over()
 
     async def _listen(self, lines: asyncio.StreamReader, connection: Connection) -> None:
         """Take what the recorder tells, to its end."""
@@ -239,7 +246,9 @@ class TlogLink(Link):
                 _log.warning("%s: %s", self.name, line.decode(errors="replace").rstrip())
                 continue
             if "deleted" in told:
-                _log.info("%s: deleted %s: %s", self.name, told["deleted"], told["why"])
+                # That it deletes by its total is routine; that a disk gets full is not.
+                level = logging.INFO if told["why"] == "most_bytes" else logging.WARNING
+                _log.log(level, "%s: deleted %s: %s", self.name, told["deleted"], told["why"])
             else:
                 self._note(told, connection)
 
@@ -255,6 +264,7 @@ class TlogLink(Link):
         elif path != self.path:
             _log.info("%s: goes on in %s", self.name, path)
         self.path, self._failure = path, failure
+        self._hand_over()
         self._tell_lost()
 
     def _tell_lost(self, at_once: bool = False) -> None:

@@ -1,0 +1,122 @@
+"""What a recording costs the service: latency and processor time, with and without, in turn.
+
+python benchmarks/recording.py --rounds 5
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median, quantiles
+
+from killed import child
+
+from risaf_link.bench.live import Course, Meter, drive, memory_mb
+from risaf_link.links.tlog import Pipe
+from risaf_link.sim.scenario import scenario
+
+SEED = 1
+SHARE = {True: "with", False: "without"}
+COMMAND = (sys.executable, "-m", "risaf_link.cli")
+
+
+@contextmanager
+def service(meter: Meter, folder: Path, rate: float, recorded: bool) -> Iterator[int]:
+    """Run the service; its process id."""
+    rates = f"emit: {{ATTITUDE_QUATERNION: {2 * rate}, ARRAY_STATUS: 5}}"
+    links = f"{{name: meter, url: 'udpout://127.0.0.1:{meter.port}', {rates}}}"
+    if recorded:
+        links += f", {{name: recording, url: 'tlog://{folder}/drive.tlog'}}"
+    command = [*COMMAND, "run", "--set", f"links=[{links}]"]
+    with subprocess.Popen(command) as process:  # noqa: S603
+        try:
+            meter.meet()
+            yield process.pid
+        finally:
+            process.terminate()
+
+
+def course(
+    sensors: int, rate: float, seconds: float, recorded: bool
+) -> tuple[Course, float, float]:
+    """One run; also the recorder's share of a core, %, and its memory, MB."""
+    chosen = scenario("circle", SEED, sensors=sensors, rate=rate, duration=min(1.0, seconds / 2))
+    meter = Meter()
+    with tempfile.TemporaryDirectory(prefix="recording") as folder:
+        try:
+            with service(meter, Path(folder), rate, recorded) as process:
+                recorder = child(process) if recorded else None
+                began, worked_s = time.perf_counter(), _worked_s(recorder)
+                one = drive(meter, process, chosen, seconds)
+                passed_s = time.perf_counter() - began
+                share = 100.0 * (_worked_s(recorder) - worked_s) / passed_s
+                return one, share, memory_mb(recorder) if recorder else 0.0
+        finally:
+            meter.close()
+
+
+def _worked_s(process: int | None) -> float:
+    if process is None:
+        return 0.0
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def compare(sensors: int, rate: float, seconds: float, rounds: int) -> None:
+    """Measure with and without in turn, and print."""
+    courses: dict[bool, list[tuple[Course, float, float]]] = {True: [], False: []}
+    for _ in range(rounds):
+        for recorded, done in courses.items():
+            done.append(course(sensors, rate, seconds, recorded))
+    print(f"{sensors} gyros at {rate:.0f} Hz, {rounds} runs of {seconds:.0f} s each")
+    for recorded, done in courses.items():
+        latencies = [one for run, _, _ in done for one in run.latencies_us]
+        percentiles = quantiles(latencies, n=100)
+        print(
+            f"  {SHARE[recorded]:8s} p50 {percentiles[49]:6.0f} us  p99 {percentiles[98]:6.0f} us"
+            f"  service {median(run.core_percent for run, _, _ in done):5.2f} % of a core"
+            f"  recorder {median(share for _, share, _ in done):5.2f} %,"
+            f" {median(memory for _, _, memory in done):4.1f} MB"
+            f"  unanswered {sum(run.unanswered for run, _, _ in done)}"
+        )
+
+
+def handing_over(frames: Sequence[bytes], repeats: int = 20_000) -> float:
+    """Handing over what came at once, us: a system call, while another process reads."""
+    pipe = Pipe()
+    with subprocess.Popen(
+        [sys.executable, "-c", "import os,time\nwhile os.read(0, 1 << 20): time.sleep(0.02)"],
+        stdin=pipe.out,
+    ) as reader:
+        data, taken, passed_s = b"".join(frames), 0, 0.0
+        while taken < repeats:
+            began = time.perf_counter()
+            done = sum(pipe.put(data, len(frames)) for _ in range(100))
+            passed_s += time.perf_counter() - began
+            taken += done
+            time.sleep(0.001 if done == 100 else 0.05)
+        pipe.close()
+        reader.wait()
+    return 1e6 * passed_s / taken
+
+
+def main() -> None:
+    """Compare at both rates."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    options = parser.parse_args()
+    for count in (1, 4, 8):
+        each = handing_over([bytes(274)] * count)
+        print(f"{count} records of 274 bytes handed over: {each:.2f} us")
+    compare(150, 100.0, options.seconds, options.rounds)
+    compare(300, 1000.0, options.seconds, options.rounds)
+
+
+if __name__ == "__main__":
+    main()
