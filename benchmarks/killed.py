@@ -82,6 +82,7 @@ def kill_once(folder: Path, seed: int, most_answers: int = MOST_ANSWERS) -> Outc
         with subprocess.Popen(command) as service:  # noqa: S603
             try:
                 meter.meet()
+                _wait_for(folder / "drive.tlog")
                 recorder = os.pidfd_open(child(service.pid))
                 sent = _drive(meter, answers)
                 until = time.perf_counter() + pause_s
@@ -108,6 +109,15 @@ def _command(path: Path, port: int) -> list[str]:
         f"{{name: recording, url: 'tlog://{path}', {emit}, {limits}}}"
     )
     return [sys.executable, "-m", "risaf_link.cli", "run", "--set", f"links=[{links}]"]
+
+
+def _wait_for(path: Path) -> None:
+    """Wait for the recorder: before it reads, only as much as a pipe holds outlives the service."""
+    until = time.perf_counter() + SAFETY_S
+    while not path.exists():
+        if time.perf_counter() > until:
+            raise NotWholeError(f"{path} has not come in {SAFETY_S:.0f} s")
+        time.sleep(0.001)
 
 
 def _drive(meter: Meter, answers: int) -> list[Burst]:
