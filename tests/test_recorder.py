@@ -384,34 +384,57 @@ def test_what_was_written_is_durable_once_a_second(
 
 
 def packed(*marks: int) -> bytes:
+    """Messages whose numbers are their marks."""
     data = b""
     for mark in marks:
         record, count = message(mark)
-        data += recorder.HEAD.pack(recorder.MARK, len(record), count) + record
+        data += recorder.HEAD.pack(recorder.MARK, len(record), count, mark) + record
     return data
 
 
-@pytest.mark.parametrize("at", range(1, 2 * 106, 7))
+@pytest.mark.parametrize("at", range(1, 2 * 114, 7))
 def test_messages_are_whole_however_they_are_cut(at: int) -> None:
     data = packed(1, 2)
     first, rest = recorder.cut(data[:at])
     second, left = recorder.cut(rest + data[at:])
-    assert (first + second, left) == ([message(1), message(2)], b"")
+    assert (first + second, left) == ([(1, message(1)), (2, message(2))], b"")
 
 
 def test_half_a_message_at_the_end_is_no_message() -> None:
-    assert recorder.cut(packed(1, 2)[:-1])[0] == [message(1)]
+    assert recorder.cut(packed(1, 2)[:-1])[0] == [(1, message(1))]
 
 
-def filled(data: bytes, written: Callable[[], int] = lambda: 0) -> Inbox:
-    """What is in a pipe that nobody holds any more."""
-    out, into = os.pipe()
-    os.write(into, data)
-    os.close(into)
-    inbox = Inbox(out)
+def filled(*contents: bytes, written: Callable[[], int] = lambda: 0) -> Inbox:
+    """What is in pipes that nobody holds any more."""
+    outs = []
+    for data in contents:
+        out, into = os.pipe()
+        os.write(into, data)
+        os.close(into)
+        outs.append(out)
+    inbox = Inbox(outs)
     inbox.fill(written)
-    os.close(out)
+    for out in outs:
+        os.close(out)
     return inbox
+
+
+def test_messages_of_several_pipes_are_written_in_the_order_of_their_numbers() -> None:
+    inbox = filled(packed(3, 4, 9), packed(1, 2, 7, 8), packed(5, 6))
+    assert inbox.waiting == [message(number) for number in range(1, 10)]
+    assert inbox.taken == 900
+
+
+def test_a_message_waits_for_those_before_it_that_are_in_another_pipe() -> None:
+    out, into = os.pipe()
+    inbox = Inbox([out])
+    for written, delivered in [((1, 2), [1, 2]), ((4, 6), [1, 2]), ((3, 5), [1, 2, 3, 4, 5, 6])]:
+        os.write(into, packed(*written))
+        assert inbox._read(out)
+        inbox._deliver(at_once=False)
+        assert inbox.waiting == [message(number) for number in delivered]
+    os.close(into)
+    os.close(out)
 
 
 def test_the_last_record_is_written_and_durable_when_the_pipe_ends(bench: Make) -> None:

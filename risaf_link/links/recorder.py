@@ -1,11 +1,12 @@
 """The process that writes a recording, and lives on when the service is killed.
 
 `TlogLink` runs this file by its path, so that nothing but the standard library is imported: 10 MB.
-Standard input is a pipe of messages: `HEAD`, then whole records. What is in the pipe outlives the
-service, and this process ends when it has written all of it and nobody holds the other end any
-more; signals that mean the service do not end it.
+It reads messages from pipes: `HEAD`, then whole records. There are several, as none may be larger
+than a megabyte: when one is full the next is taken, and numbers tell the order. What is in them
+outlives the service, and this process ends when it has written all of it and nobody holds the
+other ends any more; signals that mean the service do not end it.
 
-One thread empties the pipe into memory, the other writes: a card or a network disk may take its
+One thread empties the pipes into memory, the other writes: a card or a network disk may take its
 time, and until memory is full nobody notices. Standard output carries a line of JSON whenever
 something has changed: `path`, `failure`, `records` and `bytes` written so far; or `deleted`, `why`.
 """
@@ -20,20 +21,21 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-HEAD = struct.Struct("<HHH")  # MARK, bytes that follow, records that they are
+HEAD = struct.Struct("<HHHQ")  # MARK, bytes that follow, records that they are, which message
 MARK = 0x7454
 PIPE_BYTES = 1 << 20  # what Linux lets everybody have
-PAUSE_S = 0.02  # between two looks into the pipe: it holds more than ten times what comes in that
+PAUSE_S = 0.02  # between two looks into the pipes
 MOST_WAITING = 32 << 20  # bytes in memory: 15 s of 300 sensors at 1 kHz, 5 min of 150 at 100 Hz
 MOST_UNSYNCED = 4 << 20  # bytes that may have to be written again
 MOST_AT_ONCE = 1 << 20  # bytes
 SHARE_OF_ALL = 4  # segments that `most_bytes` holds at least
 
 Message = tuple[bytes, int]  # whole records, and how many
+Numbered = tuple[int, Message]
 Tell = Callable[[dict[str, Any]], None]
 
 
@@ -301,12 +303,12 @@ class Recording:
 
 
 class Inbox:
-    """What came through the pipe and waits to be written.
+    """What came through the pipes and waits to be written.
 
     Parameters
     ----------
-    pipe : int
-        Where it comes from, a file descriptor.
+    pipes : sequence of int
+        Where it comes from, file descriptors.
 
     Attributes
     ----------
@@ -318,59 +320,78 @@ class Inbox:
         Whether something has come since it was cleared, and whether nothing will any more.
     """
 
-    def __init__(self, pipe: int) -> None:
-        self._pipe = pipe
+    def __init__(self, pipes: Sequence[int]) -> None:
+        self._pipes = dict.fromkeys(pipes, b"")  # with the beginning of a message from each
+        self._early: list[Numbered] = []  # others come before
+        self._next: int | None = None
         self.waiting: list[Message] = []
         self.taken = 0
         self.more = threading.Event()
         self.ended = threading.Event()
 
     def fill(self, written: Callable[[], int]) -> None:
-        """Empty the pipe until nobody holds its other end.
+        """Empty the pipes until nobody holds their other ends.
 
         Parameters
         ----------
         written : callable
             How many of the bytes that came are written: the others are in memory.
         """
-        hung_up = select.poll()
-        hung_up.register(self._pipe, 0)
-        rest = b""
+        hung_up, readable = select.poll(), select.poll()
+        for pipe in self._pipes:
+            hung_up.register(pipe, 0)
+            readable.register(pipe, select.POLLIN)
         try:
-            while True:
+            while self._pipes:
                 while self.taken - written() > MOST_WAITING and not hung_up.poll(PAUSE_S * 1000):
                     pass
-                data = os.read(self._pipe, PIPE_BYTES)
-                if not data:
-                    break
-                rest = self._take(rest + data)
+                for pipe, _ in readable.poll():
+                    if not self._read(pipe):
+                        readable.unregister(pipe)
+                        hung_up.unregister(pipe)
+                self._deliver(at_once=not self._pipes)
                 self.more.set()
                 time.sleep(PAUSE_S)
         finally:
             self.ended.set()
             self.more.set()
 
-    def _take(self, data: bytes) -> bytes:
-        """Take whole messages; what is left of the data."""
-        messages, rest = cut(data)
-        self.taken += sum(len(records) for records, _ in messages)
-        self.waiting += messages
-        return rest
+    def _read(self, pipe: int) -> bool:
+        """Read all that is in a pipe; False: it has ended."""
+        data = os.read(pipe, PIPE_BYTES)
+        if not data:
+            del self._pipes[pipe]
+            return False
+        messages, self._pipes[pipe] = cut(self._pipes[pipe] + data)
+        self._early += messages
+        return True
+
+    def _deliver(self, at_once: bool) -> None:
+        """Let them be written in their order."""
+        self._early.sort()
+        for count, (number, message) in enumerate(self._early):
+            if self._next is not None and number > self._next and not at_once:
+                del self._early[:count]
+                return
+            self._next = number + 1
+            self.taken += len(message[0])
+            self.waiting.append(message)
+        self._early.clear()
 
 
-def cut(data: bytes) -> tuple[list[Message], bytes]:
-    """Cut what comes through the pipe into messages; the rest may be the beginning of one."""
-    messages: list[Message] = []
+def cut(data: bytes) -> tuple[list[Numbered], bytes]:
+    """Cut what comes through a pipe into messages; the rest may be the beginning of one."""
+    messages: list[Numbered] = []
     at = 0
     while len(data) - at >= HEAD.size:
-        mark, size, records = HEAD.unpack_from(data, at)
+        mark, size, records, number = HEAD.unpack_from(data, at)
         start = at + HEAD.size
         at = start + size
         if mark != MARK:  # nobody but us writes there, whole messages only
             return messages, b""
         if at > len(data):
             return messages, data[start - HEAD.size :]
-        messages.append((data[start:at], records))
+        messages.append((number, (data[start:at], records)))
     return messages, data[at:]
 
 
@@ -411,14 +432,14 @@ def work(recording: Recording, inbox: Inbox, tell: Tell, retry_s: float) -> None
 
 
 def main() -> None:
-    """Record what standard input brings; the argument is JSON: `path` and the limits."""
+    """Record what the pipes bring; the argument is JSON: `path`, the limits and the pipes."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     options = json.loads(sys.argv[1])
-    retry_s = options.pop("retry_s")
+    retry_s, pipes = options.pop("retry_s"), options.pop("pipes")
     os.set_blocking(sys.stdout.fileno(), False)
     recording = Recording(**options, tell=_print)
-    inbox = Inbox(sys.stdin.fileno())
+    inbox = Inbox(pipes)
     filling = threading.Thread(target=inbox.fill, args=[lambda: recording.bytes], daemon=True)
     filling.start()
     work(recording, inbox, _print, retry_s)

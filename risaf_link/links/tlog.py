@@ -2,6 +2,7 @@
 
 import asyncio
 import fcntl
+import itertools
 import json
 import logging
 import os
@@ -24,7 +25,8 @@ from risaf_link.mavlink.tlog import RECEIVED, SENT, record
 FLUSH_S = 1.0
 LEAVE_S = 5.0  # that the end waits for the recorder: a network disk may hang for ever
 TELL_LOST_S = 60.0  # from one line on lost records to the next
-MOST_WAITING = 65536  # records in our memory, while the pipe is full or not there
+MOST_WAITING = 65536  # records in our memory, while the pipes are full or not there
+PIPES = 8  # of a megabyte each
 ROOM = select.PIPE_BUF - recorder.HEAD.size  # bytes of records that go into a pipe whole or not
 
 _log = logging.getLogger(__name__)
@@ -42,47 +44,60 @@ class RecordingParameters(Struct, frozen=True, forbid_unknown_fields=True):
 DEFAULTS = RecordingParameters()
 
 
-class Pipe:
+class Pipes:
     """Records on their way to the recorder: they outlive both sides of it.
 
-    What is written goes in whole or not at all, and what is read is all there is.
+    What is written goes in whole or not at all, and what is read is all there is. When one is full
+    the next is taken: together they hold three seconds of 300 sensors at 1 kHz.
     """
 
     def __init__(self) -> None:
-        self.out, self._in = os.pipe()
-        with suppress(OSError):  # if many pipes are open the system allows us less
-            fcntl.fcntl(self._in, fcntl.F_SETPIPE_SZ, recorder.PIPE_BYTES)
-        os.set_blocking(self._in, False)
+        self.outs: list[int] = []
+        self._ins: list[int] = []
+        self._number = 0
+        for _ in range(PIPES):
+            out, into = os.pipe()
+            self.outs.append(out)
+            self._ins.append(into)
+            with suppress(OSError):  # if many pipes are open the system allows us less
+                fcntl.fcntl(into, fcntl.F_SETPIPE_SZ, recorder.PIPE_BYTES)
+            os.set_blocking(into, False)
 
     def put(self, records: bytes, count: int) -> bool:
         """Write records of no more than `ROOM` together; False: there is no room."""
-        try:
-            os.write(self._in, recorder.HEAD.pack(recorder.MARK, len(records), count) + records)
-        except BlockingIOError:
-            return False
-        return True
+        head = recorder.HEAD.pack(recorder.MARK, len(records), count, self._number)
+        for _ in self.outs:
+            try:
+                os.write(self._ins[0], head + records)
+            except BlockingIOError:
+                self._ins.append(self._ins.pop(0))
+            else:
+                self._number += 1
+                return True
+        return False
 
     def take(self) -> list[recorder.Message]:
         """Read what the recorder has not."""
-        ready, _, _ = select.select([self.out], [], [], 0)
-        return recorder.cut(os.read(self.out, recorder.PIPE_BYTES))[0] if ready else []
+        ready, _, _ = select.select(self.outs, [], [], 0)
+        found = [recorder.cut(os.read(out, recorder.PIPE_BYTES))[0] for out in ready]
+        return [message for _, message in sorted(itertools.chain(*found))]
 
     def end(self) -> None:
         """Say that nothing will come any more."""
-        os.close(self._in)
-        self._in = -1
+        while self._ins:
+            os.close(self._ins.pop())
 
     def close(self) -> None:
         """Close both sides."""
-        os.close(self.out)
-        if self._in >= 0:
-            self.end()
+        self.end()
+        while self.outs:
+            os.close(self.outs.pop())
 
 
 class TlogLink(Link):
     """A recording. Nothing is ever received from it.
 
-    Records go through a pipe to a process of its own, which writes them: a disk that takes its
+    Records go through pipes to a process of its own, which writes them: a disk that takes its
     time holds nobody up, and what was handed over is written though the service be killed. They
     wait in memory only before that process has started, and if it takes nothing.
 
@@ -124,11 +139,11 @@ class TlogLink(Link):
             "flush_s": flush_s,
             "retry_s": flush_s,
         }
-        self._pipe: Pipe | None = None
+        self._pipes: Pipes | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._waiting: deque[recorder.Message] = deque()  # for the pipe
+        self._waiting: deque[recorder.Message] = deque()  # for the pipes
         self._waiting_records = 0
-        self._handed = self._written = 0  # records that went into the pipe, and were written
+        self._handed = self._written = 0  # records that went into the pipes, and were written
         self._bytes = 0  # that it told of
         self._failure: str | None = None  # that it told of; None: nothing yet
         self._told_lost = 0
@@ -155,8 +170,8 @@ class TlogLink(Link):
         self._hand_over()
 
     def _hand_over(self) -> None:
-        """Put into the pipe what waits and goes in."""
-        while self._waiting and self._pipe is not None and self._pipe.put(*self._waiting[0]):
+        """Put into the pipes what waits and goes in."""
+        while self._waiting and self._pipes is not None and self._pipes.put(*self._waiting[0]):
             _, count = self._waiting.popleft()
             self._waiting_records -= count
             self._handed += count
@@ -169,24 +184,24 @@ class TlogLink(Link):
             self.counts.dropped_out += self._handed - self._written + self._waiting_records
             self._handed = self._written = self._waiting_records = 0
             self._waiting.clear()
-            if self._pipe is not None:
-                self._pipe.close()
-                self._pipe = None
+            if self._pipes is not None:
+                self._pipes.close()
+                self._pipes = None
             self._tell_lost(at_once=True)
 
     async def _hold(self, connection: Connection) -> None:
-        if self._pipe is None:
-            self._pipe = Pipe()
+        if self._pipes is None:
+            self._pipes = Pipes()
             self._hand_over()
-        process, lines = self._start(self._pipe)
+        process, lines = self._start(self._pipes)
         try:
             await self._listen(lines, connection)
             status = process.wait()  # it has closed all its files: that is its very end
-            self._recover(self._pipe.take())
+            self._recover(self._pipes.take())
             raise ChildProcessError(f"the recorder has ended with status {status}")
         except asyncio.CancelledError:
             self._hand_over()
-            self._pipe.end()
+            self._pipes.end()
             try:
                 async with asyncio.timeout(LEAVE_S):
                     await self._listen(lines, connection)
@@ -199,17 +214,19 @@ class TlogLink(Link):
             asyncio.get_running_loop().remove_reader(_stdout(process))
             _stdout(process).close()
 
-    def _start(self, pipe: Pipe) -> tuple[subprocess.Popen[bytes], asyncio.StreamReader]:
+    def _start(self, pipes: Pipes) -> tuple[subprocess.Popen[bytes], asyncio.StreamReader]:
         """Start a recorder; the lines that it tells.
 
         It must be there before anything is received, so this waits the millisecond that it takes.
         """
-        command = [sys.executable, "-I", "-S", recorder.__file__, json.dumps(self._options)]
+        options = json.dumps(self._options | {"pipes": pipes.outs})
+        command = [sys.executable, "-I", "-S", recorder.__file__, options]
         self._process = process = subprocess.Popen(  # noqa: S603
             command,
-            stdin=pipe.out,
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
+            pass_fds=pipes.outs,
             cwd="/",
             start_new_session=True,
         )
@@ -279,7 +296,7 @@ class TlogLink(Link):
 
 
 def _messages(records: Sequence[bytes]) -> Iterator[recorder.Message]:
-    """Put records together that go into the pipe at once."""
+    """Put records together that go into a pipe at once."""
     part: list[bytes] = []
     size = 0
     for one in records:
