@@ -271,8 +271,9 @@ class TlogLink(Link):
 
     def _note(self, state: dict[str, Any], connection: Connection) -> None:
         """Take what the recorder says of itself."""
-        self.counts.bytes_out += state["bytes"] - self._bytes
-        self._bytes, self._written = state["bytes"], state["records"]
+        written = max(state["bytes"], self._bytes)  # some may have to be written again
+        self.counts.bytes_out += written - self._bytes
+        self._bytes, self._written = written, state["records"]
         failure, path = state["failure"], Path(state["path"] or self.path)
         if failure and failure != self._failure:
             _log.warning("%s: down: %s", self.name, failure)
