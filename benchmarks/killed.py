@@ -6,7 +6,7 @@ SIGKILL. Then the recording must be whole records from the first byte to the las
 
 - all frames that were sent before the last answered epoch was whole, in order, none twice, and of
   what was sent after it what the service had taken by then;
-- everything that the service had answered.
+- everything that the service had answered: the recording stands first among its links.
 
     python benchmarks/killed.py --kills 200
 """
@@ -105,8 +105,8 @@ def _command(path: Path, port: int) -> list[str]:
     emit = "emit: {ATTITUDE_QUATERNION: 10000}"
     limits = f"recording: {{segment_bytes: {SEGMENT_BYTES}, least_free_bytes: 0}}"
     links = (
-        f"{{name: meter, url: 'udpout://127.0.0.1:{port}', {emit}}}, "
-        f"{{name: recording, url: 'tlog://{path}', {emit}, {limits}}}"
+        f"{{name: recording, url: 'tlog://{path}', {emit}, {limits}}}, "
+        f"{{name: meter, url: 'udpout://127.0.0.1:{port}', {emit}}}"
     )
     return [sys.executable, "-m", "risaf_link.cli", "run", "--set", f"links=[{links}]"]
 

@@ -140,8 +140,6 @@ class Service:
         )
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
-        others = (link for link in self.links if link not in self._recordings)
-        self._first_recorded = [*self._recordings, *others]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
         self._blocks = BlockReader(
             self.pipeline.ingest, self.pipeline.assembler, apart=HEARD, longest=1
@@ -183,7 +181,8 @@ class Service:
         _log.info("started: %s (%s, %s)", names, kernel, loop)
         try:
             async with asyncio.TaskGroup() as tasks:
-                for link in self._first_recorded:
+                # A recorder is there before anything can be received.
+                for link in sorted(self.links, key=lambda link: link not in self._recordings):
                     tasks.create_task(link.run(partial(self._receive, link)))
                 for output in self._outputs:
                     tasks.create_task(self._run_output(output))
@@ -244,8 +243,7 @@ class Service:
         """Record what was taken, but for keys."""
         if not self._recordings:
             return
-        rows = np.flatnonzero(table.cuts["message_id"] != SETUP_SIGNING).tolist()
-        frames = [table.frame(row).raw for row in rows]
+        frames = table.raw(but=SETUP_SIGNING)
         for recording in self._recordings:
             recording.record(received_us, *frames)
 
@@ -262,7 +260,7 @@ class Service:
                         self._leave_out(output)
 
     def _peers(self) -> Iterator[Peer]:
-        return ((link.name, peer) for link in self._first_recorded for peer in link.peers)
+        return ((link.name, peer) for link in self.links for peer in link.peers)
 
     def _hand_out(self, frames: list[tuple[Peer, bytes]]) -> None:
         for (link, peer), raw in frames:

@@ -284,6 +284,8 @@ def test_tables_hold_the_frames_that_are_returned_one_by_one(parts, prefix_size,
         for row, start in enumerate(table.payloads):
             payload = table.buffer[start : start + table.cuts["size"][row]]
             assert payload == table.frame(row).payload
+        others = [table.frame(row) for row in range(len(table))]
+        assert table.raw(but=0) == [frame.raw for frame in others if frame.message_id != 0]
 
 
 @pytest.mark.parametrize("mix", KNOWN_MIXES)

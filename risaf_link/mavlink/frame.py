@@ -60,6 +60,14 @@ class FrameTable:
         headers = np.where(self.cuts["version"] == 2, HEADERS[2], HEADERS[1])
         return self.cuts["start"] + headers
 
+    def raw(self, but: int) -> list[bytes]:
+        """Give the frames of all messages but one, as they came."""
+        return [
+            self.buffer[start : start + HEADERS[version] + size + CHECKSUM + SIGNATURE * signed]
+            for start, _, message_id, version, *_, size, signed, _ in self.cuts.tolist()
+            if message_id != but
+        ]
+
     def frame(self, row: int) -> Frame:
         """One of the frames."""
         return _frame(self.buffer, self.cuts[row].item())
