@@ -1,7 +1,9 @@
 """The files that a recorder writes, on disks that are full, broken, or emptied by others."""
 
 import errno
+import fcntl
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -444,6 +446,37 @@ def test_the_last_record_is_written_and_durable_when_the_pipe_ends(bench: Make) 
     assert one.files == {"drive.tlog": [1, 2, 3]}
     path = str(one.folder / "drive.tlog")
     assert told == [{"path": path, "failure": "", "records": 3, "bytes": 300}]
+
+
+def test_the_pipe_is_emptied_while_the_disk_hangs(
+    bench: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs, goes_on = threading.Event(), threading.Event()
+
+    def hang(_: int) -> None:
+        hangs.set()
+        assert goes_on.wait(20.0)
+
+    monkeypatch.setattr(os, "fdatasync", hang)
+    one = bench(segment_bytes=100_000_000, flush_s=0.0)
+    out, into = os.pipe()
+    fcntl.fcntl(into, fcntl.F_SETPIPE_SZ, recorder.PIPE_BYTES)
+    inbox = Inbox([out])
+    filling = threading.Thread(target=inbox.fill, args=[lambda: one.recording.bytes])
+    working = threading.Thread(target=work, args=[one.recording, inbox, one.told.append, 1000.0])
+    filling.start()
+    working.start()
+    os.write(into, packed(0))
+    assert hangs.wait(20.0)
+    for number in range(1, 30_000):  # three times what the pipe holds
+        data, count = message(number % 256)
+        os.write(into, recorder.HEAD.pack(recorder.MARK, len(data), count, number) + data)
+    goes_on.set()
+    os.close(into)
+    filling.join()
+    working.join()
+    os.close(out)
+    assert one.files == {"drive.tlog": [number % 256 for number in range(30_000)]}
 
 
 def test_a_pipe_that_ends_is_emptied_though_memory_is_full(
