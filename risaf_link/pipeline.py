@@ -9,7 +9,9 @@ that a live run that is recorded and replayed gives the same estimates, bit for 
 
 from functools import partial
 from itertools import groupby
+from zlib import crc32
 
+import msgspec
 from msgspec import Struct, field, structs
 
 from risaf_link.core.array import ArrayCalibration, Calibration
@@ -18,7 +20,10 @@ from risaf_link.core.estimate import ArrayStatus, Estimate, EstimateBlock
 from risaf_link.core.estimator import Estimator
 from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
+from risaf_link.core.memory import ArrayIdentity, Memory
 from risaf_link.core.rotation import Floats
+from risaf_link.core.track import RESETS, WALK
+from risaf_link.core.warm import Trial
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
@@ -48,12 +53,16 @@ class Pipeline:
         System and component id of this service; its own frames are not taken for input.
     calibration : ArrayCalibration or None
         Of the array; None: its readings are taken as they come.
+    memory : Memory or None
+        What was known before a restart.
 
     Attributes
     ----------
     mismatch : str
         Why the calibration is not that of the array which sends, in one line; there are no
         estimates from such epochs. Empty: all is well.
+    recalled : str
+        What came of the memory, in one line; empty: there is none, or it is not known yet.
     """
 
     def __init__(
@@ -61,6 +70,7 @@ class Pipeline:
         parameters: PipelineParameters,
         own: tuple[int, int],
         calibration: ArrayCalibration | None = None,
+        memory: Memory | None = None,
     ) -> None:
         p = parameters
         sensors = p.array.sensors or (len(calibration.gyros) if calibration else 0)
@@ -68,8 +78,9 @@ class Pipeline:
         clocks = {IDS["SYSTEM_TIME"], IDS["TIMESYNC"]}
         self._decisive = self.ingest.message_ids - SAMPLES | clocks
         self.assembler = EpochAssembler(structs.replace(p.array, sensors=sensors))
-        self.mismatch = ""
+        self.mismatch = self.recalled = ""
         self._calibration = Calibration(calibration) if calibration else None
+        self._checksum = crc32(msgspec.json.encode(calibration)) if calibration else 0
         self._clock = VehicleClock(own[1])
         self._parameters = p
         self._delay = 0.0  # s, of the samples
@@ -77,6 +88,8 @@ class Pipeline:
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
         self._waiting: list[tuple[Epoch, int]] = []
+        self._trial = Trial(memory) if memory else None
+        self._latest: EstimateBlock | None = None
 
     def configure(self, parameters: PipelineParameters) -> None:
         """Take new parameters of fusion, heading and attitude, from the next epoch on.
@@ -91,13 +104,30 @@ class Pipeline:
 
     def restart(self) -> None:
         """Start the attitude filter, and what judges its headings, anew; the array stays known."""
+        self._give_up("state ignored: the filter was started anew")
         self._estimator.restart()
         self._finder = HeadingFinder(self._parameters.heading)
         self._monitor = HeadingMonitor(self._parameters.heading)
 
     def set_bias(self, rate_b: Floats, variance: Floats) -> None:
         """Believe the mean fused rate of a vehicle at rest, (3,) rad/s, and its variance."""
+        self._give_up("state ignored: the bias was set anew")
         self._estimator.set_bias(rate_b, variance)
+
+    def memory(self) -> Memory | None:
+        """Tell what is known, so that it outlasts a restart; None: it is not worth it, or not yet.
+
+        It is not while an older memory is on trial; and of other fusions than `robust` and other
+        filters than `eskf` nothing can be told.
+        """
+        latest = self._latest
+        if latest is None or self._trial:
+            return None
+        parts = self._estimator.memory(latest.track.values[-1, WALK].copy())
+        if parts is None or not len(parts[0]):
+            return None
+        times = int(latest.time_us[-1]), int(latest.received_us[-1])
+        return Memory(self._identity(len(parts[0])), *times, *parts)
 
     def adopt(self, own: tuple[int, int]) -> None:
         """Take note that this service has other ids now."""
@@ -142,31 +172,32 @@ class Pipeline:
         """Use the epochs that wait."""
         waiting, self._waiting = self._waiting, []
         same_array = groupby(waiting, lambda each: (each[0].rates_b.shape, each[0].forces_b.shape))
-        blocks = (self._advance(EpochBlock.of(list(epochs))) for _, epochs in same_array)
-        return [block for block in blocks if block]
+        groups = (self._advance(EpochBlock.of(list(epochs))) for _, epochs in same_array)
+        return [block for blocks in groups for block in blocks]
 
     def advance(self, epochs: EpochBlock) -> list[EstimateBlock]:
         """Carry the estimate on over epochs that ingest and assembler have handed on already."""
-        before = self.release()
-        block = self._advance(epochs)
-        return [*before, block] if block else before
+        return [*self.release(), *self._advance(epochs)]
 
     def _wait(self, epochs: list[Epoch], received_us: int) -> None:
         self._waiting += [(epoch, received_us) for epoch in epochs]
 
-    def _advance(self, epochs: EpochBlock) -> EstimateBlock | None:
-        """Carry the estimate on; None: the calibration is not of this array."""
-        sensors = epochs.rates_b.shape[1]
-        if not self._fits(sensors):
-            return None
+    def _advance(self, epochs: EpochBlock) -> list[EstimateBlock]:
+        """Carry the estimate on; none if the calibration is not of this array."""
+        if not self._fits(epochs.rates_b.shape[1]):
+            return []
         rates_b, forces_b = epochs.rates_b, epochs.forces_b
         if self._calibration:
             rates_b, forces_b = self._calibration.apply(rates_b, forces_b)
+            epochs = structs.replace(epochs, rates_b=rates_b, forces_b=forces_b)
         delay = self.ingest.delay_of(self.assembler.source)
         if delay != self._delay:
             self._set_delay(delay)
-        track, elapsed = self._estimator.advance(epochs.dt, rates_b, forces_b)
-        return EstimateBlock(
+        return self._continue(epochs)
+
+    def _carry_on(self, epochs: EpochBlock) -> EstimateBlock:
+        track, elapsed = self._estimator.advance(epochs.dt, epochs.rates_b, epochs.forces_b)
+        self._latest = EstimateBlock(
             epochs.time_us,
             epochs.received_us,
             self._clock.boot_times(epochs.time_us, epochs.received_us),
@@ -174,20 +205,61 @@ class Pipeline:
             elapsed,
             track,
             self._monitor.advance(elapsed, track.aligned),
-            partial(self._array_status, sensors),
+            partial(self._array_status, epochs.rates_b.shape[1]),
         )
+        return self._latest
+
+    def _try(self, trial: Trial, epochs: EpochBlock) -> list[EstimateBlock]:
+        """Carry the estimate on while a memory is on trial, and judge it when that is over."""
+        share = trial.share(epochs.dt)
+        tried, rest = epochs.part(slice(share)), epochs.part(slice(share, None))
+        trial.note_epochs(tried, self._estimator.elapsed)
+        blocks = [self._carry_on(tried)]
+        if trial.is_over:
+            self._judge(trial, int(blocks[0].track.values[-1, RESETS]))
+        return [*blocks, *self._continue(rest)] if len(rest) else blocks
+
+    def _continue(self, epochs: EpochBlock) -> list[EstimateBlock]:
+        return self._try(self._trial, epochs) if self._trial else [self._carry_on(epochs)]
+
+    def _judge(self, trial: Trial, resets: int) -> None:
+        found = self._identity(trial.memory.array.sensors)
+        if found != trial.memory.array:
+            self._give_up(f"state ignored: {_difference(found, trial.memory.array)}")
+            return
+        verdict = trial.judge(self._in_force(), resets)
+        self._give_up(verdict.text)
+        self._estimator = verdict.estimator or self._estimator
+
+    def _give_up(self, text: str) -> None:
+        """End the trial, if there is one."""
+        if self._trial:
+            self._trial, self.recalled = None, text
+
+    def _identity(self, sensors: int) -> ArrayIdentity:
+        source = self.assembler.source
+        info = source and self.ingest.info(source)
+        encoding, array_id = (source.encoding, source.array_id) if source else ("", 0)
+        return ArrayIdentity(encoding, array_id, info.name if info else "", sensors, self._checksum)
 
     def _set_delay(self, delay: float) -> None:
         """Take samples for so many seconds old: a fix is less late than against present ones."""
-        p, self._delay = self._parameters, delay
+        self._delay = delay
         self._clock.delay_us = round(delay * 1e6)
-        heading = structs.replace(p.heading, delay=max(p.heading.delay - delay, 0.0))
-        self._estimator.configure(p.fusion, p.attitude, heading)
+        self._estimator.configure(*self._in_force())
+
+    def _in_force(self) -> tuple[FusionParameters, AttitudeParameters, HeadingParameters]:
+        """Parameters of the estimator."""
+        p = self._parameters
+        heading = structs.replace(p.heading, delay=max(p.heading.delay - self._delay, 0.0))
+        return p.fusion, p.attitude, heading
 
     def _correct(self, fix: GpsFix) -> None:
         """Correct the attitude by a GPS fix."""
         motion = self._finder.take(fix, self._estimator.elapsed)
         self._monitor.note_motion(motion)
+        if self._trial:
+            self._trial.note_fix(motion, fix.latitude)
         innovation = self._estimator.correct(motion, fix.latitude)
         if innovation and motion.heading:
             self._monitor.note_innovation(motion.heading, innovation)
@@ -212,3 +284,12 @@ class Pipeline:
             max(sensors, info.sensors if info else 0), info.name if info else ""
         )
         return not self.mismatch
+
+
+def _difference(found: ArrayIdentity, expected: ArrayIdentity) -> str:
+    """What tells two arrays apart, in words."""
+    for name in ("encoding", "id", "name", "calibration"):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        if ours != theirs:
+            return f"array's {name}: found {ours!r}, expected {theirs!r}"
+    return "another array"

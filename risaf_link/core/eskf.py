@@ -57,6 +57,7 @@ from risaf_link.core.error_state import (
 )
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.heading import HeadingParameters
+from risaf_link.core.memory import FilterMemory, known_errors
 from risaf_link.core.quaternion import Quaternion, Vector
 from risaf_link.core.rotation import Floats, wrap
 
@@ -200,6 +201,38 @@ class Eskf:
     def set_covariance(self, covariance: Floats) -> None:
         """Take a covariance for that of the error, (29, 29)."""
         self._covariance = covariance.copy()
+
+    def memory(self, bias_walk: Floats) -> FilterMemory:
+        """Tell what is known; `bias_walk`, (3,), is that of the last fused rate."""
+        return FilterMemory(
+            self.quaternion,
+            self._rate.copy(),
+            known_errors(self._bias, self._scale, self._force_errors, self._wrong),
+            self.covariance,
+            bias_walk,
+            None if math.isnan(self._latitude) else self._latitude,
+            self._aligned,
+            self._levelled,
+            self.resting,
+        )
+
+    def recall(self, memory: FilterMemory, resets: int) -> None:
+        """Go on from what was known before a restart, at that time.
+
+        Parameters
+        ----------
+        memory : FilterMemory
+        resets : int
+            How often yaw has been set since.
+        """
+        self.set_attitude(memory.q_nb)
+        self.set_covariance(memory.covariance)
+        self._rate = memory.rate_b.copy()
+        bias, scale, self._force_errors, self._wrong = np.split(memory.errors, (3, 12, 24))
+        self._bias, self._scale = bias, scale.reshape(3, 3)
+        self._latitude = math.nan if memory.latitude is None else memory.latitude
+        self._aligned, self._levelled = memory.aligned, memory.levelled
+        self._resets = resets
 
     def predict(self, fused: FusedRate, dt: float) -> None:
         """Carry the state on to the time of a fused rate.

@@ -6,7 +6,7 @@ Where there is a kernel it does the run; what it does at an epoch is `step`. Wha
 between two runs.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from msgspec import structs
@@ -18,6 +18,7 @@ from risaf_link.core.error_state import BIAS_AXES
 from risaf_link.core.fusion import Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion
+from risaf_link.core.memory import ArrayMemory, FilterMemory
 from risaf_link.core.rotation import Floats
 from risaf_link.core.track import RESETS, Track
 
@@ -108,6 +109,49 @@ class Estimator:
         covariance[BIAS_AXES, BIAS_AXES] += float(error @ error) + EARTH_RATE**2
         self._filter.set_covariance(covariance)
         self._filter.correct_zero_rate(rate_b, variance, confirmed=True)
+
+    def memory(
+        self, bias_walk: Floats
+    ) -> tuple[ArrayMemory, ArrayMemory, FilterMemory] | None:
+        """Tell what is known of gyros, accelerometers and attitude.
+
+        None: this fusion, or this filter, cannot tell. `bias_walk`, (3,), is that of the last
+        fused rate.
+        """
+        if not isinstance(self.fusion, kernel.Robust) or isinstance(self._filter, PaperFilter):
+            return None
+        parts = self.fusion.memory(), self._force_fusion.memory()
+        return *parts, self._filter.memory(bias_walk)
+
+    def recall(
+        self,
+        gyros: ArrayMemory,
+        accelerometers: ArrayMemory | None,
+        attitude: FilterMemory | None,
+        resets: int,
+        steps: Iterable[tuple[FusedRate, float]],
+    ) -> None:
+        """Go on from what was known before a restart; None: of that, nothing is.
+
+        Parameters
+        ----------
+        gyros, accelerometers : ArrayMemory
+        attitude : FilterMemory
+        resets : int
+            How often yaw has been set since.
+        steps : iterable of FusedRate and float
+            Rates, and for how long each, s, from then until now.
+        """
+        if not isinstance(self.fusion, kernel.Robust) or isinstance(self._filter, PaperFilter):
+            raise TypeError("recall: found another fusion or filter, expected robust and eskf")
+        self.fusion.recall(gyros)
+        if accelerometers is not None:
+            self._force_fusion.recall(accelerometers)
+        if attitude is not None:
+            self._filter.recall(attitude, resets)
+            for fused, dt in steps:
+                self._filter.predict(fused, dt)
+            self._guard.note_hearsay()
 
     def advance(self, dt: Floats, rates_b: Floats, forces_b: Floats) -> tuple[Track, Floats]:
         """Carry the estimate on over k epochs, at least one.

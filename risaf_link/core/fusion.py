@@ -98,12 +98,17 @@ class EpochBlock(Struct, frozen=True):  # as those that come of it: live, it is 
 
     def each(self) -> "Iterator[EpochBlock]":
         """The epochs, one by one."""
-        for i in range(len(self)):
-            one = slice(i, i + 1)
-            rates_b, forces_b = self.rates_b[one], self.forces_b[one]
-            yield EpochBlock(
-                self.time_us[one], self.dt[one], rates_b, forces_b, self.received_us[one]
-            )
+        return (self.part(slice(i, i + 1)) for i in range(len(self)))
+
+    def part(self, some: slice) -> "EpochBlock":
+        """Some of the epochs."""
+        return EpochBlock(
+            self.time_us[some],
+            self.dt[some],
+            self.rates_b[some],
+            self.forces_b[some],
+            self.received_us[some],
+        )
 
 
 @dataclass(frozen=True, slots=True)

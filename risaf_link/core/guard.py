@@ -170,11 +170,16 @@ class HeadingGuard:
         self._turns = 1  # how many of them are known
         self._aligned = False
         self._confirmed = 0.0  # s for which headings have agreed with yaw
+        self._is_hearsay = False  # yaw is remembered, and no heading has agreed with it since
 
     def configure(self, parameters: HeadingParameters) -> None:
         """Take new parameters; what was learnt stays."""
         self._parameters = parameters
         self._dispute.longest = LONGEST_DEFENCE * parameters.reset_after
+
+    def note_hearsay(self) -> None:
+        """Take note that yaw is remembered from before a restart: it is not defended for long."""
+        self._is_hearsay = True
 
     def advance(self, track: Track, elapsed: Floats, dt: Floats) -> None:
         """Take note of k epochs: the time of each, s, and since the one before, (k,).
@@ -277,6 +282,7 @@ class HeadingGuard:
         self, estimator: Estimator, motion: Motion, measured: Measured, pause: float
     ) -> Innovation:
         self._dispute.settle()
+        self._is_hearsay = False
         if pause <= self._parameters.timeout:
             self._confirmed += pause
         if _is_course(motion):
@@ -323,6 +329,7 @@ class HeadingGuard:
         self._whiteness = Whiteness()
         self._dispute.settle()
         self._confirmed = 0.0
+        self._is_hearsay = False
         self.gear.confirm(self.gear.sign)
         return innovation
 
@@ -341,7 +348,7 @@ class HeadingGuard:
         """
         shortest = self._parameters.reset_after
         longest = LONGEST_DEFENCE * shortest
-        if speed < STANDING_SPEED:
+        if speed < STANDING_SPEED or self._is_hearsay:
             return shortest
         if math.cos(compared.value) < OPPOSITE:
             return longest

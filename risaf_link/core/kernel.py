@@ -3,6 +3,7 @@
 The NumPy forms stay the statement of what is done, and run where nothing was built.
 """
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from risaf_link.core.eskf import USUAL_HEADING
 from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate, Fusion, FusionParameters
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.health import SILENT_AFTER, ArrayHealth, judge_silence
+from risaf_link.core.memory import ArrayMemory, FilterMemory
 from risaf_link.core.rotation import Floats
 
 BUILT = native is not None
@@ -112,6 +114,15 @@ class _Robust(_Fusion):
         """Judge the sensors as of the last epoch; of a sensor, its worst axis counts."""
         return ArrayHealth(*self.kernel.health())
 
+    def memory(self) -> ArrayMemory:
+        """Tell what was learnt."""
+        return ArrayMemory(*self.kernel.memory())
+
+    def recall(self, memory: ArrayMemory) -> None:
+        """Go on from what was learnt before a restart, in place of anything learnt since."""
+        m = memory
+        self.kernel.recall(m.channels, m.axes, m.elapsed, m.calm)
+
 
 _SOURCES = ("heading", "gravity", "size", "rest")
 _OUTCOMES = tuple(Outcome)
@@ -177,6 +188,30 @@ class _Eskf:
     def set_covariance(self, covariance: Floats) -> None:
         """Take a covariance for that of the error, (29, 29)."""
         self.kernel.set_covariance(covariance)
+
+    def memory(self, bias_walk: Floats) -> FilterMemory:
+        """Tell what is known; `bias_walk`, (3,), is that of the last fused rate."""
+        q_nb, rate_b, _, _, aligned, _ = self.kernel.state()
+        errors, latitude, levelled, resting = self.kernel.memory()
+        return FilterMemory(
+            q_nb,
+            rate_b,
+            errors,
+            self.covariance,
+            bias_walk,
+            None if math.isnan(latitude) else latitude,
+            aligned,
+            levelled,
+            resting,
+        )
+
+    def recall(self, memory: FilterMemory, resets: int) -> None:
+        """Go on from what was known before a restart, at that time."""
+        m = memory
+        latitude = math.nan if m.latitude is None else m.latitude
+        self.kernel.recall(
+            m.q_nb, m.rate_b, m.errors, m.covariance, latitude, m.aligned, m.levelled, resets
+        )
 
     def predict(self, fused: FusedRate, dt: float) -> None:
         """Carry the state on to the time of a fused rate."""

@@ -62,6 +62,7 @@ from numpy.typing import NDArray
 
 from risaf_link.core.fusion import MAD_TO_STD, Epoch, FusedRate, FusionParameters
 from risaf_link.core.health import SILENT_AFTER, ArrayHealth, Reason, SensorState
+from risaf_link.core.memory import AXES, CHANNELS, ArrayMemory
 from risaf_link.core.rotation import Floats
 
 Bools = NDArray[np.bool_]
@@ -160,6 +161,23 @@ class Robust:
     def health(self) -> ArrayHealth:
         """Judge the sensors as of the last epoch; of a sensor, its worst axis counts."""
         return judge(self._channels, self._trusted)
+
+    def memory(self) -> ArrayMemory:
+        """Tell what was learnt."""
+        c = self._channels
+        axes = [getattr(self, f"_{name}").ravel() for name in AXES]
+        channels = np.array([getattr(c, name) for name in CHANNELS])
+        return ArrayMemory(channels, np.array(axes), self._elapsed, self._calm)
+
+    def recall(self, memory: ArrayMemory) -> None:
+        """Go on from what was learnt before a restart, in place of anything learnt since."""
+        self._channels = Channels.new(len(memory))
+        for name, values in zip(CHANNELS, memory.channels, strict=True):
+            setattr(self._channels, name, values.copy())
+        for name, values in zip(AXES, memory.axes, strict=True):
+            setattr(self, f"_{name}", values.reshape(getattr(self, f"_{name}").shape).copy())
+        self._elapsed, self._calm = memory.elapsed, memory.calm
+        self._trusted = self._channels.calm >= self._parameters.hold_time
 
     def fuse(self, epoch: Epoch) -> FusedRate:
         """Fuse the next epoch; its number of sensors may differ from the one before."""

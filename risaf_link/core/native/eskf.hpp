@@ -127,6 +127,7 @@ class Eskf {
   bool levelled() const { return levelled_; }
   bool aligned() const { return aligned_; }
   int resets() const { return resets_; }
+  double latitude() const { return latitude_; }
   bool resting() const { return elapsed_ - rested_ < c.LARGEST_GAP; }
   double covariance(std::size_t i, std::size_t j) const { return covariance_[i][j]; }
 
@@ -210,6 +211,30 @@ class Eskf {
     for (std::size_t i = 0; i < STATES; ++i) {
       std::copy_n(covariance + STATES * i, STATES, covariance_[i]);
     }
+  }
+
+  // What is held to make readings and headings wrong, in the order of the covariance.
+  std::array<double, STATES - GYRO> errors() const {
+    std::array<double, STATES - GYRO> all;
+    auto end = std::copy(bias_.begin(), bias_.end(), all.begin());
+    end = std::copy(scale_.begin(), scale_.end(), end);
+    end = std::copy(force_errors_.begin(), force_errors_.end(), end);
+    std::copy(wrong_.begin(), wrong_.end(), end);
+    return all;
+  }
+
+  // `recall` of eskf.py, but for attitude and covariance.
+  void recall(const Vector& rate_b, const double* errors, double latitude, bool aligned,
+              bool levelled, int resets) {
+    rate_ = rate_b;
+    std::copy_n(errors, 3, bias_.begin());
+    std::copy_n(errors + 3, 9, scale_.begin());
+    std::copy_n(errors + ERRORS, ERRORS, force_errors_.begin());
+    std::copy_n(errors + 2 * ERRORS, 2, wrong_.begin());
+    latitude_ = latitude;
+    aligned_ = aligned;
+    levelled_ = levelled;
+    resets_ = resets;
   }
 
   void predict(const FusedAxis* fused, double dt) {

@@ -108,6 +108,24 @@ nb::tuple state(const Eskf& filter) {
                         filter.aligned(), filter.resets(), filter.bias_std());
 }
 
+// Errors (26,), latitude, levelled, resting: with `state`, `FilterMemory` of memory.py.
+nb::tuple memory(const Eskf& filter) {
+  const auto errors = filter.errors();
+  auto* values = new double[errors.size()];
+  std::copy(errors.begin(), errors.end(), values);
+  return nb::make_tuple(owned(values, {errors.size()}), filter.latitude(), filter.levelled(),
+                        filter.resting());
+}
+
+void recall(Eskf& filter, const Floats<nb::shape<4>>& q_nb, const Three& rate_b,
+            const Floats<nb::shape<26>>& errors, const Floats<nb::shape<29, 29>>& covariance,
+            double latitude, bool aligned, bool levelled, int resets) {
+  const double* q = q_nb.data();
+  filter.set_attitude({q[0], q[1], q[2], q[3]});
+  filter.set_covariance(covariance.data());
+  filter.recall(vector(rate_b), errors.data(), latitude, aligned, levelled, resets);
+}
+
 template <typename Fusion>
 Array<double> advance(Fusion& gyros, risaf::Robust& accelerometers, Eskf& filter, Aiding& aiding,
                       const Floats<nb::shape<-1>>& dt, const Floats<nb::shape<-1, -1, 3>>& rates_b,
@@ -143,6 +161,8 @@ void bind_filter(nb::module_& m) {
       .def("set_covariance", [](Eskf& filter, const Floats<nb::shape<29, 29>>& covariance) {
         filter.set_covariance(covariance.data());
       })
+      .def("memory", &memory)
+      .def("recall", &recall)
       .def("predict", &predict)
       .def("compare_heading", &compare_heading)
       .def("correct_heading", [](Eskf& filter, double heading, double variance, double age, double gate) {

@@ -54,6 +54,24 @@ nb::tuple health(const risaf::Robust& robust) {
                         owned(bias, {n, 3}));
 }
 
+// Channels (5, 3, n), axes (6, 3), elapsed, calm: `ArrayMemory` of memory.py.
+nb::tuple memory(const risaf::Robust& robust) {
+  const std::size_t n = robust.sensors();
+  constexpr std::size_t rows = risaf::Robust::CHANNELS.size(), values = risaf::Robust::AXES.size();
+  auto *channels = new double[rows * 3 * n], *axes = new double[values * 3];
+  robust.tell(channels, axes);
+  return nb::make_tuple(owned(channels, {rows, 3, n}), owned(axes, {values, 3}), robust.elapsed(),
+                        robust.calm());
+}
+
+using Channels = nb::ndarray<const double, nb::shape<5, 3, -1>, nb::c_contig, nb::device::cpu>;
+using Axes = nb::ndarray<const double, nb::shape<6, 3>, nb::c_contig, nb::device::cpu>;
+
+void recall(risaf::Robust& robust, const Channels& channels, const Axes& axes, double elapsed,
+            double calm) {
+  robust.recall(channels.shape(2), channels.data(), axes.data(), elapsed, calm);
+}
+
 Array<double> relative_bias(const risaf::Risaf& fusion) {
   return by_axis(fusion.readings().sensors,
                  [&](std::size_t k) -> const risaf::Row& { return fusion.relative_bias(k); });
@@ -125,7 +143,9 @@ NB_MODULE(_kernel, m) {
   fusion<risaf::Robust>(m, "Robust")
       .def(nb::init<risaf::RobustParameters>())
       .def("configure", &risaf::Robust::configure, "parameters"_a)
-      .def("health", &health);
+      .def("health", &health)
+      .def("memory", &memory)
+      .def("recall", &recall);
 
   bind_filter(m);
   bind_frames(m);

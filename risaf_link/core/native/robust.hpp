@@ -79,6 +79,50 @@ class Robust {
     }));
   }
 
+  // What is remembered over a restart, as memory.py has it: rows of channels, values of axes.
+  static constexpr std::array<Row Axis::*, 5> CHANNELS{&Axis::bias, &Axis::age, &Axis::slow,
+                                                       &Axis::calm, &Axis::out};
+  static constexpr std::array<double Axis::*, 6> AXES{&Axis::spread,    &Axis::slow_spread,
+                                                      &Axis::turning,   &Axis::jitter,
+                                                      &Axis::calm_walk, &Axis::noise};
+
+  double elapsed() const { return elapsed_; }
+  double calm() const { return calm_; }
+
+  // Tell it: channels (5, 3, n), axes (6, 3).
+  void tell(double* channels, double* axes) const {
+    for (std::size_t k = 0; k < 3; ++k) {
+      for (std::size_t j = 0; j < CHANNELS.size(); ++j) {
+        std::copy_n((axes_[k].*CHANNELS[j]).begin(), n_, channels + (3 * j + k) * n_);
+      }
+      for (std::size_t j = 0; j < AXES.size(); ++j) {
+        axes[3 * j + k] = axes_[k].*AXES[j];
+      }
+    }
+  }
+
+  // Go on from it, with n sensors.
+  void recall(std::size_t n, const double* channels, const double* axes, double elapsed,
+              double calm) {
+    axes_ = {};
+    n_ = 0;
+    resize(n);
+    for (std::size_t k = 0; k < 3; ++k) {
+      Axis& a = axes_[k];
+      for (std::size_t j = 0; j < CHANNELS.size(); ++j) {
+        std::copy_n(channels + (3 * j + k) * n, n, (a.*CHANNELS[j]).begin());
+      }
+      for (std::size_t j = 0; j < AXES.size(); ++j) {
+        a.*AXES[j] = axes[3 * j + k];
+      }
+      for (std::size_t i = 0; i < n; ++i) {
+        a.trusted[i] = a.calm[i] >= p.hold_time ? 1.0 : 0.0;
+      }
+    }
+    elapsed_ = elapsed;
+    calm_ = calm;
+  }
+
   // `judge` of robust.py: of each sensor, by its worst axis, and its bias (n, 3).
   void health(std::int8_t* state, std::int8_t* reason, double* rejected, double* bias) const {
     for (std::size_t i = 0; i < n_; ++i) {

@@ -1,0 +1,131 @@
+"""A start that goes on from what was known before a restart, as far as it still holds.
+
+Nothing is believed at once. For the first second the estimator runs as one that knows nothing, and
+says so; what comes in is kept. Then what is remembered is held against it, and what stands goes
+through once more with the same second: no estimate ever rests on a memory that has failed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from risaf_link.core.attitude import AttitudeParameters
+from risaf_link.core.estimator import Estimator
+from risaf_link.core.fusion import EpochBlock, FusionParameters
+from risaf_link.core.heading import HeadingParameters, Motion
+from risaf_link.core.interruption import Interruption
+from risaf_link.core.memory import FilterMemory, Memory
+from risaf_link.core.rotation import Floats
+
+TRIAL = 1.0  # s, in which what is remembered is held against what comes
+FEWEST = 5  # epochs that it takes
+PATIENCE = 5.0  # s for which an array may be incomplete at first
+UNITS = (("s", 1.0), ("min", 60.0), ("h", 3600.0), ("days", 86400.0))
+
+Parameters = tuple[FusionParameters, AttitudeParameters, HeadingParameters]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What came of a memory."""
+
+    text: str  # in one line, for the operator
+    estimator: Estimator | None = None  # that goes on from it, as of now; None: it was of no use
+
+
+class Trial:
+    """The first second after a start.
+
+    Parameters
+    ----------
+    memory : Memory
+    """
+
+    def __init__(self, memory: Memory) -> None:
+        self.memory = memory
+        self._waited = 0.0  # s
+        self._begin()
+
+    def _begin(self) -> None:
+        self._events: list[EpochBlock | tuple[Motion, float]] = []
+        self._began: float | None = None  # s, time of the estimator before the first epoch
+        self._seconds = 0.0
+        self._epochs = 0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it is time to `judge`."""
+        return self._is_complete or self._waited >= PATIENCE
+
+    @property
+    def _is_complete(self) -> bool:
+        return self._seconds >= TRIAL and self._epochs >= FEWEST
+
+    def share(self, dt: Floats) -> int:
+        """How many of these epochs, (k,) s each since the one before, belong to the trial."""
+        count = np.arange(1, len(dt) + 1)
+        complete = (np.cumsum(dt) + self._seconds >= TRIAL) & (count + self._epochs >= FEWEST)
+        return int(complete.argmax()) + 1 if complete.any() else len(dt)
+
+    def note_epochs(self, epochs: EpochBlock, began: float) -> None:
+        """Take note of epochs, calibrated, before which an estimator's time was `began`, s."""
+        self._waited += float(epochs.dt.sum())
+        if epochs.rates_b.shape[1] != len(self.memory.gyros):
+            self._begin()
+            return
+        if self._began is None:
+            self._began = began
+        self._events.append(epochs)
+        self._seconds += float(epochs.dt.sum())
+        self._epochs += len(epochs)
+
+    def note_fix(self, motion: Motion, latitude: float) -> None:
+        """Take note of what a fix said; latitude in rad."""
+        if self._began is not None:
+            self._events.append((motion, latitude))
+
+    def judge(self, parameters: Parameters, resets: int) -> Verdict:
+        """Hold the memory against the trial.
+
+        Parameters
+        ----------
+        parameters : tuple
+            Of the estimator.
+        resets : int
+            How often yaw has been set during the trial.
+        """
+        fusion, attitude, heading = parameters
+        if fusion.method != "robust" or attitude.filter != "eskf":
+            return Verdict("state ignored: it is of another fusion or filter")
+        if self._began is None or not self._is_complete:
+            return Verdict(f"state ignored: not {len(self.memory.gyros)} sensors")
+        epochs = [event for event in self._events if isinstance(event, EpochBlock)]
+        motions = [event[0] for event in self._events if not isinstance(event, EpochBlock)]
+        interruption = Interruption(self.memory, epochs, motions)
+        refusal = interruption.refusal()
+        if refusal:
+            return Verdict(f"state ignored: {refusal}")
+        known = interruption.attitude(fusion, attitude, heading)
+        aligned = known is not None and known.aligned
+        warm = Estimator(*parameters)
+        warm.elapsed = self._began
+        warm.recall(
+            self.memory.gyros.older(interruption.changed(fusion), interruption.dt),
+            self.memory.accelerometers if aligned else None,
+            known,
+            resets + 1 if aligned else 0,
+            interruption.steps(attitude) if aligned else (),
+        )
+        for event in self._events:
+            if isinstance(event, EpochBlock):
+                warm.advance(event.dt, event.rates_b, event.forces_b)
+            else:
+                warm.correct(*event)
+        return Verdict(_told(known, interruption.age), warm)
+
+
+def _told(known: FilterMemory | None, age: float) -> str:
+    what = "sensors' biases" if known is None else "biases" if not known.aligned else "heading"
+    unit, seconds = next(each for each in UNITS if age < 100 * each[1] or each is UNITS[-1])
+    return f"warm start: {what} of {age / seconds:.0f} {unit} ago"
+
