@@ -277,10 +277,10 @@ def replay(
     risaf-link replay drive.tlog --report drive --mcap drive.mcap
     risaf-link replay night/*/*.tlog --csv tables --cluster tcp://10.0.0.1:8786
     """
-    from risaf_link.kept import chosen_by, load_in_force
+    from risaf_link.kept import chosen_by, load_for_replay
     from risaf_link.replay import Selection
 
-    config = load_in_force(config_path, settings)
+    config = load_for_replay(config_path, settings)
     span = options["start"], options["end"], options["outages"]
     selection = Selection(*span, chosen_by(settings))
     if len(logs) > 1 or options["workers"] or options["cluster"]:

@@ -47,6 +47,13 @@ class MavlinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
     parameters: str = ""  # file that keeps what was set over MAVLink
 
 
+class StateParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is kept of biases, health and heading, so that a restart goes on from there."""
+
+    file: str = ""  # empty: nothing is
+    period: Annotated[float, Meta(ge=0.1, le=3600)] = 5.0  # s, from one writing to the next
+
+
 class LinkParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """One link."""
 
@@ -62,6 +69,7 @@ class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
     """Everything that can be configured."""
 
     mavlink: MavlinkParameters = field(default_factory=MavlinkParameters)
+    state: StateParameters = field(default_factory=StateParameters)
     emit: Annotated[Rates, Tunable(RATE_NAMES, "Hz")] = field(default_factory=DEFAULT_RATES.copy)
     """how often it goes to a peer that has not asked for another rate, on links without an `emit`
     of their own."""

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from msgspec import structs
 
-from risaf_link.config import Config, load
+from risaf_link.config import Config, StateParameters, load
 from risaf_link.mavlink.parameters import Parameters, parameters_of
 
 HEAD = "# Parameters that were set over MAVLink; they go over the configuration.\n"
@@ -84,6 +85,18 @@ def load_in_force(config_path: Path | None, settings: Iterable[str] = ()) -> Con
     """
     config = load(config_path, settings)
     return Parameters(config, kept_parameters(config, config_path, settings).values).tuned
+
+
+def load_for_replay(config_path: Path | None, settings: Iterable[str] = ()) -> Config:
+    """Read a configuration as `load_in_force` does, for a log.
+
+    The state that a vehicle keeps is of now, not of the log's time: only one that `settings` name
+    is used.
+    """
+    config = load_in_force(config_path, settings)
+    if any(setting.startswith("state.file=") for setting in settings):
+        return config
+    return structs.replace(config, state=StateParameters())
 
 
 def chosen_by(settings: Iterable[str]) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """A log through the pipeline, and how far its heading was from truth."""
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -29,8 +30,11 @@ from risaf_link.mavlink.telemetry import ComponentState, Emitter
 from risaf_link.mavlink.tlog import SENT, Stamps, TlogReader, record
 from risaf_link.mavlink.truth import Truths, truths_in
 from risaf_link.pipeline import Pipeline
+from risaf_link.remembered import memory_file
 
 LOG: Peer = ("log", "")
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +108,8 @@ class Replay:
     def __init__(self, config: Config, path: Path, selection: Selection) -> None:
         self._path = path
         self._selection = selection
-        self._pipeline = Pipeline(config, config.own, load_calibration(config))
+        memory = memory_file(config).read()
+        self._pipeline = Pipeline(config, config.own, load_calibration(config), memory)
         self.identity = identity_of(config)
         parameters = Parameters(config, fixed=selection.fixed)
         self._component = Component(parameters, self._pipeline, self.identity, keep=self._keep)
@@ -158,6 +163,8 @@ class Replay:
         yield from self._noted(self._pipeline.flush(received_us))
         self.scorer.finish()
         self._seconds = time.perf_counter() - began
+        if self._pipeline.recalled:
+            _log.warning("%s: %s", self._path, self._pipeline.recalled)
         self._require_estimates()
 
     def summary(self) -> dict[str, Any]:

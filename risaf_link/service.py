@@ -26,7 +26,7 @@ from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.component import HEARD, Component
 from risaf_link.mavlink.frame import FrameParser, FrameTable
 from risaf_link.mavlink.held import Held
-from risaf_link.mavlink.notices import Notice
+from risaf_link.mavlink.notices import Notice, Severity
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.requests import Requests
@@ -34,6 +34,7 @@ from risaf_link.mavlink.signing import SETUP_SIGNING, Rejection
 from risaf_link.pipeline import Pipeline
 from risaf_link.publish.account import Account, Traffic
 from risaf_link.publish.output import Output
+from risaf_link.remembered import memory_file
 
 TICK_S = 0.1  # from one look at what is due by time to the next
 OPENING = 20  # looks at whether the links are open, in the first TICK_S
@@ -111,7 +112,12 @@ class Service:
         clock_us: Callable[[], int] = unix_us,
     ) -> None:
         parameters = Parameters(config, kept.values, kept.overruled)
-        self.pipeline = Pipeline(parameters.tuned, config.own, load_calibration(config))
+        self._memory_file = memory_file(config)
+        memory = self._memory_file.read()
+        if memory:
+            self._memory_file.keep_used()
+        calibration = load_calibration(config)
+        self.pipeline = Pipeline(parameters.tuned, config.own, calibration, memory)
         self.links = [
             open_link(link.url, link.name, clock_us, link.recording) for link in config.links
         ]
@@ -152,8 +158,12 @@ class Service:
         self._frames_in: Counter[str] = Counter()  # by link
         self._frames_out: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()  # from peers that are forgotten
-        self._mismatch = ""
         self._outputs = self._open_outputs(config)
+        self._mismatch = self._recalled = ""
+        self._state_period = config.state.period
+        self._next_state_s = 0.0
+        self._remembered_us = 0
+        self._remembering = False
 
     @property
     def dropped(self) -> Counter[str]:
@@ -191,6 +201,7 @@ class Service:
                 finally:  # the links are still open
                     self._take_held()
                     self._send(self.pipeline.flush(self._received_us))
+                    self._remember_now()
         finally:
             self._keys.close()
             counts = self.pipeline.assembler.counts
@@ -230,6 +241,7 @@ class Service:
                 self._send(self.pipeline.release())
         self._hand_out(self._component.collect(self._peers()))
         self._tell_mismatch()
+        self._tell_recalled()
 
     def _accepted(self, table: FrameTable, link: str) -> FrameTable:
         """Those frames that the link's signing takes."""
@@ -281,6 +293,31 @@ class Service:
         task = asyncio.create_task(work)
         self._storing.add(task)
         task.add_done_callback(self._storing.discard)
+
+    def _look_after_state(self, now_s: float) -> None:
+        """Store what is known, when it is due and has changed, without waiting for it."""
+        if not self._memory_file.is_named or now_s < self._next_state_s or self._remembering:
+            return
+        self._next_state_s = now_s + self._state_period
+        memory = self.pipeline.memory()
+        if memory is None or memory.received_us == self._remembered_us:
+            return
+        self._remembered_us = memory.received_us
+        self._remembering = True
+
+        async def store() -> None:
+            try:
+                await asyncio.to_thread(self._memory_file.write, memory)
+            finally:
+                self._remembering = False
+
+        self._begin(store())
+
+    def _remember_now(self) -> None:
+        """Store what is known at the end."""
+        memory = self.pipeline.memory() if self._memory_file.is_named else None
+        if memory is not None and not self._remembering:
+            self._memory_file.write(memory)
 
     def _look_after_keys(self, now_s: float) -> None:
         """Set their clocks, store what is due, and tell of rejected frames."""
@@ -371,6 +408,16 @@ class Service:
             if self._mismatch:
                 _log.error("no estimates: array.calibration: %s", self._mismatch)
 
+    def _tell_recalled(self) -> None:
+        """Tell what came of the memory, once."""
+        if self.pipeline.recalled == self._recalled:
+            return
+        self._recalled = self.pipeline.recalled
+        ignored = "ignored" in self._recalled
+        _log.log(logging.WARNING if ignored else logging.INFO, "%s", self._recalled)
+        severity = Severity.WARNING if ignored else Severity.INFO
+        self._component.tell(Notice(severity, self._recalled))
+
     async def _beat(self) -> None:
         """Do what is due by time; HEARTBEAT follows the estimator's progress.
 
@@ -384,6 +431,7 @@ class Service:
         while True:
             self._take_held()
             self._look_after_keys(loop.time())
+            self._look_after_state(loop.time())
             self._component.advance(round(loop.time() * 1e6), self._clock_us())
             self._hand_out(self._component.collect(self._peers()))
             await asyncio.sleep(TICK_S)

@@ -15,7 +15,7 @@ LAYERS = [
     {"links", "publish", "sim"},
     {"config", "sweep"},
     {"kept"},
-    {"keys"},
+    {"keys", "remembered"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench", "demo"},
     {"judgement"},

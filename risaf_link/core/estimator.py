@@ -110,9 +110,7 @@ class Estimator:
         self._filter.set_covariance(covariance)
         self._filter.correct_zero_rate(rate_b, variance, confirmed=True)
 
-    def memory(
-        self, bias_walk: Floats
-    ) -> tuple[ArrayMemory, ArrayMemory, FilterMemory] | None:
+    def memory(self, bias_walk: Floats) -> tuple[ArrayMemory, ArrayMemory, FilterMemory] | None:
         """Tell what is known of gyros, accelerometers and attitude.
 
         None: this fusion, or this filter, cannot tell. `bias_walk`, (3,), is that of the last

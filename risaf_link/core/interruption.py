@@ -94,7 +94,9 @@ class Interruption:
         self._centre = _median(self._relative.transpose(0, 2, 1))  # (3, k)
         first = epochs[0]
         self._host_age = (int(first.received_us[0]) - memory.received_us) / 1e6
-        self.gap = (int(first.time_us[0]) - memory.time_us) / 1e6 - float(first.dt[0])  # s, sensors'
+        self.gap = (int(first.time_us[0]) - memory.time_us) / 1e6 - float(
+            first.dt[0]
+        )  # s, sensors'
 
     @property
     def dt(self) -> float:

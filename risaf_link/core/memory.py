@@ -147,7 +147,11 @@ class Memory(Struct, frozen=True, forbid_unknown_fields=True):
     def is_sound(self) -> bool:
         """Whether it can have come from an estimator."""
         parts = self.gyros, self.accelerometers, self.attitude
-        return len(self.gyros) > 0 and all(part.is_sound for part in parts)
+        return (
+            all(0 <= time < 2**63 for time in (self.time_us, self.received_us))
+            and all(part.is_sound for part in parts)
+            and 0 < len(self.gyros) == self.array.sensors
+        )
 
 
 def known_errors(bias: Floats, scale: Floats, force: Floats, heading: Floats) -> Floats:

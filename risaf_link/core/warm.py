@@ -128,4 +128,3 @@ def _told(known: FilterMemory | None, age: float) -> str:
     what = "sensors' biases" if known is None else "biases" if not known.aligned else "heading"
     unit, seconds = next(each for each in UNITS if age < 100 * each[1] or each is UNITS[-1])
     return f"warm start: {what} of {age / seconds:.0f} {unit} ago"
-

@@ -224,6 +224,10 @@ class Component:
         if order:
             self._acknowledge(order, Result.FAILED if failure else Result.ACCEPTED)
 
+    def tell(self, notice: Notice) -> None:
+        """Tell the operators."""
+        self._tell(notice)
+
     @property
     def is_calibrating(self) -> bool:
         """Whether every estimate must be observed, even if nobody listens."""
