@@ -193,11 +193,13 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
     from risaf_link.config import load
     from risaf_link.kept import kept_parameters
     from risaf_link.service import Service, loop_factory, settled, until_told
+    from risaf_link.supervisor import of_this_process
 
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(levelname)s %(message)s")
     config = load(config_path, settings)
-    service = Service(config, kept_parameters(config, config_path, settings))
+    kept = kept_parameters(config, config_path, settings)
+    service = Service(config, kept, supervisor=of_this_process())
     with settled(), asyncio.Runner(loop_factory=loop_factory()) as runner:
         runner.run(until_told(service.run()))
 

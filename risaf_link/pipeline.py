@@ -124,10 +124,11 @@ class Pipeline:
         if latest is None or self._trial:
             return None
         parts = self._estimator.memory(latest.track.values[-1, WALK].copy())
-        if parts is None or not len(parts[0]):
+        if parts is None:
             return None
+        gyros, accelerometers, attitude = parts
         times = int(latest.time_us[-1]), int(latest.received_us[-1])
-        return Memory(self._identity(len(parts[0])), *times, *parts)
+        return Memory(self._identity(len(gyros)), *times, gyros, accelerometers, attitude)
 
     def adopt(self, own: tuple[int, int]) -> None:
         """Take note that this service has other ids now."""

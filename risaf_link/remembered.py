@@ -94,10 +94,10 @@ def encoded(memory: Memory) -> bytes:
     for kind in ("gyros", "accelerometers"):
         channels = getattr(memory, kind).channels
         digits = (10, 3, 10, 3, 3)  # as CHANNELS
-        rows = zip(channels, digits, strict=True)
-        tree[kind]["channels"] = [np.round(row, places).tolist() for row, places in rows]
-    rows = enumerate(tree["attitude"]["covariance"], 1)
-    tree["attitude"]["covariance"] = [row[:length] for length, row in rows]
+        rounded = map(np.round, channels, digits)
+        tree[kind]["channels"] = [row.tolist() for row in rounded]
+    whole = enumerate(tree["attitude"]["covariance"], 1)
+    tree["attitude"]["covariance"] = [row[:length] for length, row in whole]
     return msgspec.json.encode({"version": VERSION, "memory": tree})
 
 

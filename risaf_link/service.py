@@ -35,6 +35,7 @@ from risaf_link.pipeline import Pipeline
 from risaf_link.publish.account import Account, Traffic
 from risaf_link.publish.output import Output
 from risaf_link.remembered import memory_file
+from risaf_link.supervisor import Supervisor
 
 TICK_S = 0.1  # from one look at what is due by time to the next
 OPENING = 20  # looks at whether the links are open, in the first TICK_S
@@ -98,6 +99,8 @@ class Service:
         What was set over MAVLink before, and where it is kept.
     clock_us : callable
         Microseconds since 1970.
+    supervisor : Supervisor or None
+        Who is told how the service is.
 
     Raises
     ------
@@ -110,7 +113,9 @@ class Service:
         config: Config,
         kept: KeptParameters = NOTHING_KEPT,
         clock_us: Callable[[], int] = unix_us,
+        supervisor: Supervisor | None = None,
     ) -> None:
+        self._supervisor = supervisor or Supervisor({}, 0)
         parameters = Parameters(config, kept.values, kept.overruled)
         self._memory_file = memory_file(config)
         memory = self._memory_file.read()
@@ -199,10 +204,12 @@ class Service:
                 try:
                     await self._beat()
                 finally:  # the links are still open
+                    self._supervisor.end()
                     self._take_held()
                     self._send(self.pipeline.flush(self._received_us))
                     self._remember_now()
         finally:
+            self._supervisor.end()
             self._keys.close()
             counts = self.pipeline.assembler.counts
             _log.info("ended: %d frames, %d epochs", self._frames, counts["epochs"])
@@ -432,8 +439,12 @@ class Service:
             self._take_held()
             self._look_after_keys(loop.time())
             self._look_after_state(loop.time())
-            self._component.advance(round(loop.time() * 1e6), self._clock_us())
+            now_us = round(loop.time() * 1e6)
+            gathered = self.pipeline.assembler.counts["epochs"]
+            is_alive = self._component.note_gathered(gathered, now_us)
+            self._component.advance(now_us, self._clock_us())
             self._hand_out(self._component.collect(self._peers()))
+            self._supervisor.tell(loop.time(), lambda: self._component.status, is_alive)
             await asyncio.sleep(TICK_S)
 
 

@@ -15,7 +15,7 @@ LAYERS = [
     {"links", "publish", "sim"},
     {"config", "sweep"},
     {"kept"},
-    {"keys", "remembered"},
+    {"keys", "remembered", "supervisor"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench", "demo"},
     {"judgement"},

@@ -32,7 +32,7 @@ PARAMETERS = (
     AttitudeParameters(initial_bias_std=BIAS_STD, scale_std=1e-6, common_bias_walk=1e-9),
     HeadingParameters(delay=0.0),
 )
-SEEDS = range(30)
+SEEDS = range(20)
 
 
 @pytest.fixture(scope="module", params=FORMS, autouse=True)
@@ -146,7 +146,7 @@ class Run:
 
     @property
     def bias_ratios(self):
-        """Errors of the bias over its standard deviation, (3,), by the truth of the last seconds."""
+        """Errors of the bias over its standard deviation, (3,), by the truth of 1.5 s."""
         last = np.array(self.off[-15:])
         variance = self.estimator.memory(np.zeros(3))[2].covariance.diagonal()[3:6]
         white = NOISE**2 / SENSORS / len(last)
@@ -202,14 +202,14 @@ def runs(request, form):  # noqa: ARG001 which form is run is its doing
 def test_after_an_interruption_the_truth_lies_within_three_standard_deviations(runs):
     assert all(run.text.startswith("warm start") for run in runs)
     assert max(abs(run.yaw_ratio) for run in runs) < 3.0
-    # Of 90 values one in four series goes beyond 3.
+    # Of 60 values one in six series goes beyond 3.
     assert np.abs([run.bias_ratios for run in runs]).max() < 3.5
 
 
 def test_the_average_nees_of_the_bias_is_within_its_bounds(runs):
     squares = np.array([run.bias_ratios for run in runs]) ** 2
     _, high = bounds(squares.size)
-    assert 0.5 < squares.mean() < high  # a little pessimistic: few sensors tell little
+    assert 0.25 < squares.mean() < high  # pessimistic: few sensors tell little
 
 
 def test_nothing_is_believed_before_the_trial_is_over():
@@ -329,7 +329,10 @@ def test_a_burst_in_the_first_second_spoils_nothing():
         world.biases = true
         run.go(0.4)
     assert run.text == "warm start: heading of 2 s ago"
-    assert np.abs(run.state.bias_b - world.biases.mean(axis=0)).max() < 5e-4
+    variance = run.estimator.memory(np.zeros(3))[2].covariance.diagonal()[3:6]
+    error = run.state.bias_b - world.biases.mean(axis=0)
+    assert (np.abs(error) < 3.0 * np.sqrt(variance)).all()
+    assert np.sqrt(variance).max() < BIAS_STD / 3.0  # as after 20 s, not as at a start
 
 
 def spoilt(memory, part, **values):

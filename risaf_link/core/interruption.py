@@ -4,8 +4,9 @@ Is it the same array?
 ---------------------
 A relative bias explains why a sensor differs from the others. With those that are remembered taken
 off, the sensors must differ no more than without, each by the median of the second: shocks are
-shorter. Biases of another array make it worse: their variance adds to what is there. Fewer than three sensors cannot be held against
-one another; they are believed only while their clock has run on, since they had power.
+shorter. Biases of another array make it worse: their variance adds to what is there. Fewer than
+three sensors cannot be held against one another; they are believed only while their clock has run
+on, since they had power.
 
 How have the biases changed?
 ----------------------------
@@ -32,6 +33,7 @@ from functools import cached_property
 
 import numpy as np
 from msgspec import structs
+from numpy.typing import NDArray
 
 from risaf_link.core.aiding import QUIET
 from risaf_link.core.attitude import AttitudeParameters
@@ -214,9 +216,10 @@ class Interruption:
         return np.array([tilted, tilted, turned])
 
     @property
-    def _trusted(self) -> Floats:
+    def _trusted(self) -> NDArray[np.int64]:
         """How many channels of each axis were trusted and have been heard, (3,)."""
-        return np.isfinite(self._apart).sum(axis=1)
+        trusted: NDArray[np.int64] = np.isfinite(self._apart).sum(axis=1)
+        return trusted
 
     @property
     def _are_many(self) -> bool:
@@ -259,6 +262,8 @@ class Interruption:
             return False
         if any(motion.speed > STANDING_SPEED for motion in self._motions):
             return False
+        if not self._trusted.all():
+            return False
         quiet = np.nanstd(self._centre, axis=1) < QUIET[:3]
         return bool(quiet.all() and (np.abs(self._mean_rate) < STANDS).all())
 
@@ -266,11 +271,13 @@ class Interruption:
 def _median(values: Floats) -> Floats:
     """Median of what is finite along the last axis; NaN: nothing is."""
     (median,) = quantiles(values.reshape(-1, values.shape[-1]), (0.5,))
-    return median.reshape(values.shape[:-1])
+    reshaped: Floats = median.reshape(values.shape[:-1])
+    return reshaped
 
 
 def _deviation(channels: Floats) -> Floats:
     """Robust standard deviation of the finite channels of each axis, (3, n) -> (3,)."""
     distance = np.abs(channels - _median(channels)[:, np.newaxis])
     count = np.minimum(np.isfinite(channels).sum(axis=1), len(MAD_FACTORS) - 1)
-    return MAD_FACTORS[count] * _median(distance)
+    deviation: Floats = MAD_FACTORS[count] * _median(distance)
+    return deviation

@@ -8,6 +8,7 @@ from typing import Self
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from risaf_link.core.error_state import GYRO, STATES
 from risaf_link.core.rotation import Floats
@@ -18,7 +19,7 @@ CHANNELS = ("bias", "age", "slow", "calm", "out")
 AXES = ("spread", "slow_spread", "turning", "jitter", "calm_walk", "noise")
 """What it knows of each axis."""
 
-ERRORS = 26  # `GYRO`, `ACCELEROMETER` and `HEADING` of `Eskf`
+ERRORS = STATES - GYRO.start  # 26: `GYRO`, `ACCELEROMETER` and `HEADING` of `Eskf`
 LARGEST = 1e9  # no number of these is larger
 
 
@@ -31,22 +32,24 @@ class ArrayMemory(Struct, frozen=True, forbid_unknown_fields=True):
     calm: float  # 0 to 1, how calmly they turned
 
     def __len__(self) -> int:
-        return self.channels.shape[2]
+        return len(self.channels[0, 0])
 
     @property
     def bias(self) -> Floats:
         """Relative biases, (3, n), rad/s."""
-        return self.channels[0]
+        bias: Floats = self.channels[0]
+        return bias
 
     @property
     def noise(self) -> Floats:
         """Variance of one reading, (3,), (rad/s)^2."""
-        return self.axes[5]
+        noise: Floats = self.axes[5]
+        return noise
 
     @property
-    def trusted(self) -> Floats:
+    def trusted(self) -> NDArray[np.bool_]:
         """Which channels were, (3, n)."""
-        trusted: Floats = self.channels[4] == 0.0
+        trusted: NDArray[np.bool_] = self.channels[4] == 0.0
         return trusted
 
     @property
@@ -100,7 +103,8 @@ class FilterMemory(Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def bias_b(self) -> Floats:
         """Bias of the fused rate, (3,), rad/s."""
-        return self.errors[0:3]
+        bias_b: Floats = self.errors[0:3]
+        return bias_b
 
     @property
     def is_sound(self) -> bool:
@@ -157,6 +161,3 @@ class Memory(Struct, frozen=True, forbid_unknown_fields=True):
 def known_errors(bias: Floats, scale: Floats, force: Floats, heading: Floats) -> Floats:
     """Errors in the order of the covariance, (26,)."""
     return np.concatenate((bias, scale.ravel(), force, heading))
-
-
-assert ERRORS == STATES - GYRO.start

@@ -8,6 +8,7 @@ What is addressed to us is always answered. What is addressed to all is answered
 and where it was not, others may: we are silent.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
 from typing import Any, Protocol
@@ -187,6 +188,14 @@ class Component:
         self._notices.observe(estimate)
         self._report(self._calibration.observe(estimate))
 
+    def note_gathered(self, epochs: int, now_us: int) -> bool:
+        """Take note of how many epochs have come by now, as `advance` takes the time.
+
+        Returns whether the estimator makes something of them, or none come.
+        """
+        self._pulse.note_gathered(epochs, now_us)
+        return bool(self.trouble) or not self._pulse.is_stuck
+
     def advance(self, now_us: int, unix_us: int | None = None) -> None:
         """Do what is due by time: HEARTBEAT, notices, lists of parameters, requests.
 
@@ -223,6 +232,20 @@ class Component:
             self._stored = parameters
         if order:
             self._acknowledge(order, Result.FAILED if failure else Result.ACCEPTED)
+
+    @property
+    def status(self) -> str:
+        """How it is, in one line."""
+        estimate = self._estimate
+        if self.trouble or estimate is None:
+            return f"no estimates: {self.trouble or 'no samples yet'}"
+        if self._pulse.has_stalled:
+            return "no estimates: no samples"
+        attitude, heading = estimate.attitude, estimate.heading
+        yaw, deviation = math.degrees(attitude.euler[2]) % 360.0, math.degrees(attitude.yaw_std)
+        told = f"{yaw:.1f} deg +- {deviation:.1f}" if attitude.aligned else "not known yet"
+        state = heading.state.name.lower().replace("_", " ")
+        return f"heading {told}, {state}; {estimate.fused.valid} sensors"
 
     def tell(self, notice: Notice) -> None:
         """Tell the operators."""

@@ -13,10 +13,14 @@ class Pulse:
     ----------
     has_stalled : bool
         No epochs come, though they did.
+    is_stuck : bool
+        Epochs come, but for two seconds nothing has come of them.
     """
 
     def __init__(self) -> None:
-        self.has_stalled = False
+        self.has_stalled = self.is_stuck = False
+        self._gathered_before = 0
+        self._answered_us: int | None = None
         self._epochs = self._epochs_before = 0
         self._progress_us = 0
         self._next_us: int | None = None  # when the next one is due
@@ -31,6 +35,19 @@ class Pulse:
     def note_epoch(self) -> None:
         """Take note that the estimator has made progress."""
         self._epochs += 1
+
+    def note_gathered(self, gathered: int, now_us: int) -> None:
+        """Take note of how many epochs have come to the estimator by now, since the start.
+
+        To be called before `advance`. While none comes, nothing is stuck.
+        """
+        if (
+            self._epochs != self._epochs_before
+            or gathered == self._gathered_before
+            or self._answered_us is None
+        ):
+            self._gathered_before, self._answered_us = gathered, now_us
+        self.is_stuck = now_us - self._answered_us >= STALLED_US
 
     def advance(self, now_us: int) -> bool:
         """Let it be later, microseconds of a clock that does not jump; whether one is due."""
