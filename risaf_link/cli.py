@@ -204,6 +204,62 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
         runner.run(until_told(service.run()))
 
 
+def _rooted(command: Command) -> Command:
+    """Add the option that says which system is meant."""
+    return click.option(
+        "--root",
+        type=click.Path(path_type=Path, exists=True, file_okay=False),
+        default="/",
+        metavar="DIR",
+        help="Root directory of an image, where nothing is started.  [default: this system]",
+    )(command)
+
+
+@main.command()
+@_rooted
+@click.option(
+    "--init",
+    type=click.Choice(["systemd", "script"]),
+    help="What starts services.  [default: systemd where it is, else a script in /etc/init.d]",
+)
+@click.option(
+    "--program",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="The risaf-link that is to run.  [default: this one]",
+)
+def install(root: Path, init: str | None, program: Path | None) -> None:
+    """Make the service one of the system's, started with it and restarted when it fails.
+
+    Writes a unit for systemd or a script, a udev rule for the array and
+    /etc/risaf_link/vehicle.yaml. Files that were changed since are kept as they are.
+
+    \b
+    sudo /opt/risaf_link/bin/risaf-link install
+    sudo systemctl start risaf-link
+    """
+    from risaf_link.install import Installation, this_program
+
+    installation = Installation(root)
+    systemd = installation.has_systemd if init is None else init == "systemd"
+    for line in installation.install(program or this_program(), systemd):
+        click.echo(line)
+
+
+@main.command()
+@_rooted
+def uninstall(root: Path) -> None:
+    """Undo `install`. What was changed since, learnt or recorded is kept.
+
+    \b
+    sudo /opt/risaf_link/bin/risaf-link uninstall
+    """
+    from risaf_link.install import Installation
+
+    for line in Installation(root).uninstall():
+        click.echo(line)
+
+
 @main.command()
 @click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @_configured

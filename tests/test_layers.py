@@ -15,7 +15,7 @@ LAYERS = [
     {"links", "publish", "sim"},
     {"config", "sweep"},
     {"kept"},
-    {"keys", "remembered", "supervisor"},
+    {"keys", "remembered", "supervisor", "install"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench", "demo"},
     {"judgement"},
