@@ -18,6 +18,7 @@ from risaf_link.core.fusion import EpochBlock, FusionParameters
 from risaf_link.core.heading import Heading, HeadingParameters, HeadingSource, Motion
 from risaf_link.core.memory import ArrayIdentity, Memory
 from risaf_link.core.rotation import wrap
+from risaf_link.core.track import RESETS, WALK
 from risaf_link.core.warm import Trial
 
 FORMS = {"numpy": (robust, eskf, aiding), "kernel": (kernel, kernel, kernel)}
@@ -121,7 +122,7 @@ class Run:
         self.off.append(self.track.fused_b[0] - (0.0, 0.0, self.world.rate))
         self.epoch = epoch
         if self.trial and self.trial.is_over:
-            verdict = self.trial.judge(PARAMETERS, int(self.track.values[0, 14]))
+            verdict = self.trial.judge(PARAMETERS, int(self.track.values[0, RESETS]))
             self.trial, self.text = None, verdict.text
             self.estimator = verdict.estimator or self.estimator
 
@@ -131,7 +132,7 @@ class Run:
         self.estimator.correct(motion, LATITUDE)
 
     def memory(self):
-        parts = self.estimator.memory(self.track.values[0, 24:27])
+        parts = self.estimator.memory(self.track.values[0, WALK])
         times = int(self.epoch.time_us[0]), int(self.epoch.received_us[0])
         return Memory(ArrayIdentity("GYRO_ARRAY", 0, "", len(parts[0]), 0), *times, *parts)
 
