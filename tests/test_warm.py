@@ -18,7 +18,8 @@ from risaf_link.core.fusion import EpochBlock, FusionParameters
 from risaf_link.core.heading import Heading, HeadingParameters, HeadingSource, Motion
 from risaf_link.core.memory import ArrayIdentity, Memory
 from risaf_link.core.rotation import wrap
-from risaf_link.core.track import RESETS, WALK
+from risaf_link.core.track import RESETS
+from risaf_link.core.track import WALK as BIAS_WALK
 from risaf_link.core.warm import Trial
 
 FORMS = {"numpy": (robust, eskf, aiding), "kernel": (kernel, kernel, kernel)}
@@ -132,7 +133,7 @@ class Run:
         self.estimator.correct(motion, LATITUDE)
 
     def memory(self):
-        parts = self.estimator.memory(self.track.values[0, WALK])
+        parts = self.estimator.memory(self.track.values[0, BIAS_WALK])
         times = int(self.epoch.time_us[0]), int(self.epoch.received_us[0])
         return Memory(ArrayIdentity("GYRO_ARRAY", 0, "", len(parts[0]), 0), *times, *parts)
 
