@@ -20,7 +20,7 @@ from risaf_link.core.memory import ArrayIdentity, Memory
 from risaf_link.core.rotation import wrap
 from risaf_link.core.track import RESETS
 from risaf_link.core.track import WALK as BIAS_WALK
-from risaf_link.core.warm import Trial
+from risaf_link.core.warm import MOST, Trial
 
 FORMS = {"numpy": (robust, eskf, aiding), "kernel": (kernel, kernel, kernel)}
 UNIX_US, BOOT_US = 1_700_000_000_000_000, 5_000_000
@@ -291,7 +291,17 @@ def test_another_number_of_sensors_is_another_array():
     world = World(5, sensors=8)
     world.interrupt(12.0)
     run = Run(world, memory).go(6.0)
-    assert run.text == "state ignored: not 12 sensors"
+    assert run.text == "state ignored: no second of 12 sensors"
+
+
+def test_a_clock_that_stands_still_does_not_keep_it_waiting_for_ever():
+    memory = Run(World(5)).go(10.0).memory()
+    run = Run(World(5), memory)
+    for _ in range(MOST):
+        run.trial.note_epochs(run.world.epoch(0.0), 0.0)
+        run.trial.note_fix(run.world.fix(), LATITUDE)
+    assert run.trial.is_over
+    assert run.trial.judge(PARAMETERS, 0).estimator is None
 
 
 def test_a_heading_that_gps_contradicts_is_given_up_within_seconds():

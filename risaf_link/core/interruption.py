@@ -64,7 +64,7 @@ RATE_WALK = 0.25  # rad/s/sqrt(s): three standard deviations are a right-angled 
 KNOWN_YAW = 1.0  # rad; less well known, it is better set than corrected
 SOON = 0.2  # s, of which the rate after the gap is the median
 STEP = 0.2  # s, in which the gap is gone through
-SAMPLES = 200  # epochs that a median is taken of at most
+SAMPLES = 200  # epochs that are looked at, at most
 MEDIAN_NOISE = math.pi / 2  # variance of a median over that of a mean
 FREEDOM = 0.37  # degrees of freedom, of a sensor in a spread by median absolute deviation
 FEWEST_SENSORS = 3  # that can be held against one another
@@ -88,8 +88,11 @@ class Interruption:
     ) -> None:
         self._memory = memory
         self._motions = motions
-        self._dt = np.concatenate([block.dt for block in epochs])
-        rates_b = np.concatenate([block.rates_b for block in epochs])
+        times = np.cumsum(np.concatenate([block.dt for block in epochs]))
+        self.dt = float(times[-1] - times[0]) / max(len(times) - 1, 1)  # s, from reading to reading
+        some = slice(None, None, -(-len(times) // SAMPLES))
+        self._times = times[some] - times[0]
+        rates_b = np.concatenate([block.rates_b for block in epochs])[some]
         relative = rates_b.transpose(2, 1, 0) - memory.gyros.bias[:, :, np.newaxis]  # (3, n, k)
         heard = memory.gyros.trusted[:, :, np.newaxis] & np.isfinite(relative)
         self._relative = np.where(heard, relative, np.nan)
@@ -99,11 +102,6 @@ class Interruption:
         self.gap = (int(first.time_us[0]) - memory.time_us) / 1e6 - float(
             first.dt[0]
         )  # s, sensors'
-
-    @property
-    def dt(self) -> float:
-        """From reading to reading, s."""
-        return float(self._dt[1:].mean())
 
     @property
     def age(self) -> float:
@@ -133,8 +131,7 @@ class Interruption:
         walked = np.full(3, parameters.bias_walk**2 * self.age)
         if not self._are_many:
             return walked
-        samples = min(len(self._dt), SAMPLES)
-        noise = MEDIAN_NOISE * np.nan_to_num(self._memory.gyros.noise) / samples
+        noise = MEDIAN_NOISE * np.nan_to_num(self._memory.gyros.noise) / len(self._times)
         scale = parameters.scale_error * float(np.linalg.norm(self._mean_rate))
         freedom = np.maximum(FREEDOM * self._trusted, 2.5)
         seen = (self._spread**2 - noise - scale**2) * freedom / (freedom - 2.0)
@@ -231,9 +228,7 @@ class Interruption:
 
         NaN: it was not trusted, or is silent.
         """
-        stride = -(-len(self._dt) // SAMPLES)
-        apart = self._relative - self._centre[:, np.newaxis]
-        return _median(apart[:, :, ::stride])
+        return _median(self._relative - self._centre[:, np.newaxis])
 
     @cached_property
     def _spread(self) -> Floats:
@@ -252,7 +247,7 @@ class Interruption:
     @cached_property
     def _first_rate(self) -> Floats:
         """Of the vehicle when it was seen again, (3,), rad/s."""
-        soon = np.cumsum(self._dt) - self._dt[0] <= SOON
+        soon = self._times <= SOON
         return np.nan_to_num(_median(self._centre[:, soon]) - self._memory.attitude.bias_b)
 
     @cached_property

@@ -6,6 +6,7 @@ through once more with the same second: no estimate ever rests on a memory that 
 """
 
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -19,9 +20,11 @@ from risaf_link.core.rotation import Floats
 
 TRIAL = 1.0  # s, in which what is remembered is held against what comes
 FEWEST = 5  # epochs that it takes
+MOST = 4000  # epochs that are kept: a second at 4 kHz, if their clock moves at all
 PATIENCE = 5.0  # s for which an array may be incomplete at first
 UNITS = (("s", 1.0), ("min", 60.0), ("h", 3600.0), ("days", 86400.0))
 
+Event = EpochBlock | tuple[Motion, float]
 Parameters = tuple[FusionParameters, AttitudeParameters, HeadingParameters]
 
 
@@ -47,7 +50,7 @@ class Trial:
         self._begin()
 
     def _begin(self) -> None:
-        self._events: list[EpochBlock | tuple[Motion, float]] = []
+        self._events: list[Event] = []
         self._began: float | None = None  # s, time of the estimator before the first epoch
         self._seconds = 0.0
         self._epochs = 0
@@ -55,7 +58,7 @@ class Trial:
     @property
     def is_over(self) -> bool:
         """Whether it is time to `judge`."""
-        return self._is_complete or self._waited >= PATIENCE
+        return self._is_complete or self._waited >= PATIENCE or self._epochs >= MOST
 
     @property
     def _is_complete(self) -> bool:
@@ -81,7 +84,7 @@ class Trial:
 
     def note_fix(self, motion: Motion, latitude: float) -> None:
         """Take note of what a fix said; latitude in rad."""
-        if self._began is not None:
+        if self._began is not None and len(self._events) < 2 * MOST:
             self._events.append((motion, latitude))
 
     def judge(self, parameters: Parameters, resets: int) -> Verdict:
@@ -98,7 +101,7 @@ class Trial:
         if fusion.method != "robust" or attitude.filter != "eskf":
             return Verdict("state ignored: it is of another fusion or filter")
         if self._began is None or not self._is_complete:
-            return Verdict(f"state ignored: not {len(self.memory.gyros)} sensors")
+            return Verdict(f"state ignored: no second of {len(self.memory.gyros)} sensors")
         epochs = [event for event in self._events if isinstance(event, EpochBlock)]
         motions = [event[0] for event in self._events if not isinstance(event, EpochBlock)]
         interruption = Interruption(self.memory, epochs, motions)
@@ -116,12 +119,30 @@ class Trial:
             resets + 1 if aligned else 0,
             interruption.steps(attitude) if aligned else (),
         )
-        for event in self._events:
-            if isinstance(event, EpochBlock):
-                warm.advance(event.dt, event.rates_b, event.forces_b)
-            else:
-                warm.correct(*event)
+        for _, alike in groupby(self._events, _kind):
+            _pass(warm, list(alike))
         return Verdict(_told(known, interruption.age), warm)
+
+
+def _kind(event: Event) -> tuple[int, ...]:
+    """What events have in common that an estimator can take at once."""
+    return (
+        (*event.rates_b.shape[1:], *event.forces_b.shape[1:])
+        if isinstance(event, EpochBlock)
+        else ()
+    )
+
+
+def _pass(estimator: Estimator, events: list[Event]) -> None:
+    """Let events of one kind come to an estimator."""
+    blocks = [event for event in events if isinstance(event, EpochBlock)]
+    if blocks:
+        columns = zip(*((each.dt, each.rates_b, each.forces_b) for each in blocks), strict=True)
+        estimator.advance(*map(np.concatenate, columns))
+        return
+    for event in events:
+        if not isinstance(event, EpochBlock):
+            estimator.correct(*event)
 
 
 def _told(known: FilterMemory | None, age: float) -> str:
