@@ -191,8 +191,8 @@ class _Eskf:
 
     def memory(self, bias_walk: Floats) -> FilterMemory:
         """Tell what is known; `bias_walk`, (3,), is that of the last fused rate."""
-        q_nb, rate_b, *_, aligned, _ = self.kernel.state()
-        errors, latitude, levelled, resting = self.kernel.memory()
+        q_nb, rate_b, *_ = self.kernel.state()
+        errors, latitude, aligned, levelled, resting = self.kernel.memory()
         return FilterMemory(
             q_nb,
             rate_b,

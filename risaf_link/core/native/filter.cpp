@@ -108,13 +108,13 @@ nb::tuple state(const Eskf& filter) {
                         filter.aligned(), filter.resets(), filter.bias_std());
 }
 
-// Errors (26,), latitude, levelled, resting: with `state`, `FilterMemory` of memory.py.
+// Errors (26,), latitude, aligned, levelled, resting: with `state`, `FilterMemory` of memory.py.
 nb::tuple memory(const Eskf& filter) {
   const auto errors = filter.errors();
   auto* values = new double[errors.size()];
   std::copy(errors.begin(), errors.end(), values);
-  return nb::make_tuple(owned(values, {errors.size()}), filter.latitude(), filter.levelled(),
-                        filter.resting());
+  return nb::make_tuple(owned(values, {errors.size()}), filter.latitude(), filter.aligned(),
+                        filter.levelled(), filter.resting());
 }
 
 void recall(Eskf& filter, const Floats<nb::shape<4>>& q_nb, const Three& rate_b,
