@@ -136,6 +136,26 @@ def test_an_epoch_without_any_reading_loses_no_time(drive):
     assert after.heading.yaw - before.heading.yaw == pytest.approx(0.02 * rate, rel=0.01)
 
 
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_fix_older_than_the_first_epoch_is_not_taken_for_better_than_it_is(drive, restarted):
+    rate, began = math.radians(20), drive.time_us
+    if restarted:
+        drive.go(20, course=1.0)
+        drive.pipeline.restart()
+        began = drive.time_us
+    ratios = []
+    for _ in range(100):
+        drive.time_us += PERIOD_US
+        course = 1.0 + rate * (drive.time_us - began) / 1e6
+        (estimate,) = drive.take(drive.vehicle.epoch(drive.time_us, (0, 0, rate)))
+        if drive.time_us % 200_000 == (began + PERIOD_US) % 200_000:
+            drive.take(drive.vehicle.fix(drive.time_us, course - 0.11 * rate))
+        if estimate.attitude.aligned:
+            ratios.append(abs(wrap(estimate.heading.yaw - course)) / estimate.heading.yaw_std)
+    assert len(ratios) > 90
+    assert max(ratios) < 2.0
+
+
 def test_estimates_are_stamped_when_late_samples_were_taken_and_never_go_back(drive):
     stamps = []
     for k in range(200):

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from risaf_link.core.attitude import Innovation, PaperFilter
+from risaf_link.core.attitude import UNSEEN_TURN, Innovation, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
 from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
@@ -213,6 +213,8 @@ class HeadingGuard:
             self._turned = np.empty((ROOM + len(dt), 4))
             self._turned[: len(kept)] = kept
             self._turns = len(kept)
+        if self._turns == 1:  # it begins where the first epoch does
+            self._turned[0, 3] = elapsed[0] - dt[0]
         last, fresh = self._turned[self._turns - 1], self._turned[self._turns :][: len(dt)]
         turns = fresh[:, :3]
         np.multiply(rate_b, dt[:, np.newaxis], out=turns)
@@ -310,7 +312,8 @@ class HeadingGuard:
             raise ValueError("motion: found no heading, expected one")
         age = p.delay + heading.age
         rate_x, _, rate_z = self._rate_before(age)
-        angle, variance = heading.heading, heading.variance
+        blind = max(age - self._elapsed + float(self._turned[0, 3]), 0.0)  # before the first epoch
+        angle, variance = heading.heading, heading.variance + (UNSEEN_TURN * blind) ** 2
         if _is_course(motion):
             across = rate_z * p.antenna[0] - rate_x * p.antenna[2]
             along = math.sqrt(max(motion.speed**2 - across**2, 0.0))
