@@ -6,12 +6,14 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from risaf_link import bench, cli
+from risaf_link import bench
 from risaf_link.bench.extent import Extent
 from risaf_link.bench.feed import bursts
 from risaf_link.bench.figure import Figure, Spread
 from risaf_link.bench.machine import machine
 from risaf_link.bench.table import as_object, show
+from risaf_link.cli import main
+from risaf_link.cli.trials import GROUPS
 from risaf_link.core.kernel import BUILT
 from risaf_link.mavlink.frame import FrameParser
 from risaf_link.pipeline import Pipeline, PipelineParameters
@@ -46,7 +48,7 @@ KEYS = {
 }
 
 
-@pytest.mark.parametrize("group", cli.GROUPS)
+@pytest.mark.parametrize("group", GROUPS)
 def test_a_group_gives_all_its_figures_as_json_and_as_a_table(group):
     figures = list(bench.bench(LEAST, [group]))
     printed = json.loads(json.dumps(as_object(machine(), figures)))
@@ -94,7 +96,7 @@ def test_a_goal_is_reached_on_its_side():
 
 
 def test_the_command_prints_one_json_object():
-    result = CliRunner().invoke(cli.main, ["bench", "--quick", "--only", "start", "--json"])
+    result = CliRunner().invoke(main, ["bench", "--quick", "--only", "start", "--json"])
     printed = json.loads(result.stdout)
     assert printed["machine"]["kernel"] is BUILT
     assert set(printed["figures"]) == KEYS["start"]
