@@ -144,11 +144,13 @@ def test_coefficients_of_a_perfect_curve_are_exact():
 
 
 def test_an_exponent_is_that_of_the_growth():
-    sensors = np.array([3.0, 30.0, 100.0, 300.0, 1000.0])
+    sensors = np.array([3.0, 10.0, 30.0, 100.0, 300.0, 1000.0])
     cubic = 1e-9 * sensors**3
     assert exponent(sensors, cubic) == pytest.approx(3.0, abs=0.01)
     assert exponent(sensors, 1e-4 + 1e-6 * sensors) == pytest.approx(1.0, abs=0.03)
-    assert math.isnan(exponent(sensors, np.full(5, 1e-4)))
+    held_up = np.array([5e-4, *(1e-4 + 1e-6 * sensors[1:])])  # by something else, at the smallest
+    assert exponent(sensors, held_up) == pytest.approx(1.0, abs=0.05)
+    assert math.isnan(exponent(sensors, np.full(6, 1e-4)))
 
 
 def test_a_method_that_is_too_slow_is_stopped():
