@@ -1,7 +1,6 @@
 """A log with motion -> the file that `array.calibration` names."""
 
 import math
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from risaf_link.core.fusion import Epoch
 from risaf_link.core.mounting import Readings
 from risaf_link.core.rotation import Floats, matrix_from_quaternion
 from risaf_link.errors import ConfigError, LogError
+from risaf_link.kept import replace_file
 from risaf_link.links.file import read
 from risaf_link.mavlink.epoch import EpochAssembler, GyroChunk
 from risaf_link.mavlink.ingest import Ingest
@@ -127,12 +127,9 @@ def write(path: Path, log: Path, result: Result) -> None:
     ConfigError
         If it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.write_text(text(log, result))
-        os.replace(partial, path)  # noqa: PTH105 as atomic as it gets
+        replace_file(path, text(log, result).encode())
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise ConfigError(f"{path}: {error.strerror or error}") from None
 
 

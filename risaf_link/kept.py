@@ -6,6 +6,7 @@ They go over the configuration's file, which is never written, and under what `-
 import logging
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -121,11 +122,16 @@ def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
     """
     new = path.with_name(f"{path.name}.new")
     new.unlink(missing_ok=True)  # who may read it would be as before
-    with open(new, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
+    try:
+        with open(new, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)  # half a file
+        raise
     _sync(path.parent)
 
 
