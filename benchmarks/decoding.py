@@ -21,9 +21,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from risaf_link.bench.reading import recv_match, tables
+from risaf_link.core.fusion import EpochBlock
 from risaf_link.links.file import read
 from risaf_link.mavlink.block import BlockReader
-from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk, RegularEpochs
+from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.ingest import GpsParameters, Ingest
 from risaf_link.mavlink.tlog import TlogReader
@@ -50,7 +51,7 @@ def epochs(path: Path) -> int:
     blocks = BlockReader(decoder.ingest, decoder.assembler)
     for table, times_us in TlogReader(read(path)).tables():
         for item in blocks.read(table, times_us):
-            if not isinstance(item, RegularEpochs):
+            if not isinstance(item, EpochBlock):
                 decoder.step(*item)
     return decoder.assembler.counts["epochs"]
 

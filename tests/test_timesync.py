@@ -12,7 +12,7 @@ from test_clock import ARRAY_US, AUTOPILOT, START_US, VEHICLE_US, framed, heartb
 from wire import frame
 
 from risaf_link.mavlink import timesync
-from risaf_link.mavlink.clock import SAME_CLOCK_US, VehicleClock
+from risaf_link.mavlink.clock import MANY, SAME_CLOCK_US, VehicleClock
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import FrameParser, encode
 from risaf_link.mavlink.requests import Requests
@@ -264,24 +264,27 @@ def test_stamps_do_not_go_back_but_for_a_clock_that_was_started_anew(moments):
             last_us = stamp
 
 
-@given(MOMENTS)
-def test_many_epochs_at_once_get_the_stamps_that_each_would(moments):
+@given(MOMENTS, st.booleans())
+def test_many_epochs_at_once_get_the_stamps_that_each_would(moments, is_asked_at_once):
     one, many = Clocks(80, -80), Clocks(80, -80)
+    singly, together = [], []
     for what, amount in moments:
-        singly = []
         times = []
         for clocks in (one, many):
             happen(clocks, what, amount)
-            for _ in range(5):
+            for _ in range(2 * MANY):
                 clocks.wait(1000)
                 epoch = clocks.array_us, clocks.unix_us + clocks.now_us
                 if clocks is one:
                     singly.append(one.clock.boot_us(*epoch))
                 else:
                     times.append(epoch)
-        stamps, arrivals = np.array(times).T
-        assert many.clock.boot_times(stamps, arrivals).tolist() == singly
-        assert one.clock.now_us(arrivals[-1]) == many.clock.now_us(arrivals[-1])
+        together += [many.clock.stamps(*run.T) for run in np.split(np.array(times), [1, MANY])]
+        if is_asked_at_once:
+            together[-1]()
+    assert [stamp for stamps in together for stamp in stamps().tolist()] == singly
+    now_us = one.unix_us + one.now_us
+    assert one.clock.now_us(now_us) == many.clock.now_us(now_us)
 
 
 def test_the_time_that_others_are_told_is_that_of_the_stamps():

@@ -157,11 +157,17 @@ class Sensors:
 
 class ArrayLayout:
     def __init__(
-        self, system: int, component: int, array_id: int, gyros: Sensors, accels: Sensors
+        self,
+        system: int,
+        component: int,
+        array_id: int,
+        gyros: Sensors,
+        accels: Sensors,
+        told: bytes,
     ) -> None: ...
 
 class EpochFinder:
-    def __init__(self, kinds: list[int], jump_us: int, patience_us: int) -> None: ...
+    def __init__(self, kinds: list[int], info_id: int, jump_us: int, patience_us: int) -> None: ...
     def load(
         self, buffer: bytes, cuts: NDArray[np.uint8], times_us: NDArray[np.uint64]
     ) -> None: ...
@@ -169,10 +175,12 @@ class EpochFinder:
         self, array: ArrayLayout, time_us: int, sequence: int, heard_us: int, most: int
     ) -> (
         tuple[
-            tuple[NDArray[np.int64], Floats, Floats, Floats, NDArray[np.int64], NDArray[np.int64]],
+            tuple[NDArray[np.int64], Floats, Floats, Floats, NDArray[np.int64]],
             tuple[int, int, int, int],
+            int,
             tuple[int, int],
             list[int],
+            list[tuple[int, int]],
         ]
         | None
     ): ...

@@ -35,8 +35,6 @@ class Estimate:
     ----------
     time_us : int
         As the samples were stamped.
-    boot_us : int
-        The instant that it tells of, on the vehicle's boot clock.
     elapsed : float
         Seconds since the first epoch, whatever the clocks did.
     """
@@ -44,8 +42,12 @@ class Estimate:
     def __init__(self, block: "EstimateBlock", i: int) -> None:
         self._block, self._i = block, i
         self.time_us = int(block.time_us[i])
-        self.boot_us = int(block.boot_us[i])
         self.elapsed = float(block.elapsed[i])
+
+    @cached_property
+    def boot_us(self) -> int:
+        """The instant that it tells of, on the vehicle's boot clock."""
+        return int(self._block.boot_us[self._i])
 
     @cached_property
     def fused(self) -> FusedRate:
@@ -73,12 +75,17 @@ class EstimateBlock(Struct, frozen=True):
 
     time_us: NDArray[np.int64]  # (k,)
     received_us: NDArray[np.int64]  # (k,) when what made each of them possible came
-    boot_us: NDArray[np.int64]  # (k,)
+    stamps: Callable[[], NDArray[np.int64]]  # boot_us
     delay_us: int  # by how much the samples lag behind their stamps; boot_us is without it
     elapsed: Floats  # (k,) s
     track: Track
     heading: HeadingTrack
     array: Callable[[], ArrayStatus]  # as of now
+
+    @property
+    def boot_us(self) -> NDArray[np.int64]:
+        """The instants that they tell of, on the vehicle's boot clock, (k,)."""
+        return self.stamps()
 
     def __len__(self) -> int:
         return len(self.time_us)

@@ -198,13 +198,16 @@ class HeadingGuard:
         """Read the epochs since the last fix, together: one by one each would cost as much."""
         if not self._unread:
             return
-        tracks, times, steps = zip(*self._unread, strict=True)
+        track, elapsed, dt = self._unread[0]
+        if len(self._unread) > 1:
+            tracks, times, steps = zip(*self._unread, strict=True)
+            track = Track(np.concatenate([each.values for each in tracks]))
+            elapsed, dt = np.concatenate(times), np.concatenate(steps)
         self._unread, self._unread_epochs = [], 0
-        elapsed, dt = np.concatenate(times), np.concatenate(steps)
-        self._turn(np.concatenate([track.rate_b for track in tracks]), elapsed, dt)
-        self.gear.feel(np.concatenate([track.ahead for track in tracks]), dt)
+        self._turn(track.rate_b, elapsed, dt)
+        self.gear.feel(track.ahead, dt)
         self._elapsed = float(elapsed[-1])
-        self._aligned = bool(tracks[-1].aligned[-1])
+        self._aligned = bool(track.aligned[-1])
 
     def _turn(self, rate_b: Floats, elapsed: Floats, dt: Floats) -> None:
         """Go on with the rate's integral."""

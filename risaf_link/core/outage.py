@@ -137,7 +137,8 @@ class Scorer:
         self._by_boot, self._by_arrival = _Yaws(), _Yaws()
         self._gathered: list[EstimateBlock] = []
         self._epochs = 0  # in them
-        self._elapsed, self._now_us = 0.0, 0  # at the last epoch, when it came
+        self._elapsed = 0.0  # at the last epoch
+        self._last: EstimateBlock | None = None
 
     @property
     def outages(self) -> list[Outage]:
@@ -152,7 +153,7 @@ class Scorer:
     def take_estimates(self, block: EstimateBlock) -> None:
         """Take the next estimates."""
         self._elapsed = float(block.elapsed[-1])
-        self._now_us = int(block.boot_us[-1]) + block.delay_us
+        self._last = block
         self._gathered.append(block)
         self._epochs += len(block)
         if self._epochs >= GATHERED:
@@ -165,8 +166,9 @@ class Scorer:
     def take_withheld(self, fix: GpsFix) -> None:
         """Take a fix that the filter did not get."""
         heading = self._finder.take(fix, self._elapsed).heading
-        if heading:
-            valid_us = self._now_us - self._fix_delay_us - round(heading.age * 1e6)
+        if heading and self._last:
+            now_us = int(self._last.boot_us[-1]) + self._last.delay_us
+            valid_us = now_us - self._fix_delay_us - round(heading.age * 1e6)
             self._by_boot.expect("gps", np.array([valid_us]), np.array([heading.heading]))
 
     def finish(self) -> None:

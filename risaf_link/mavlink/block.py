@@ -5,8 +5,9 @@ epoch after epoch, whole, with all sensors in order, numbered one by one; and no
 is missing. Whatever else the pipeline reads is handed on frame by frame, in its place. So nothing
 comes out otherwise than it would frame by frame; it only comes sooner.
 
-Of an epoch into which such a frame falls, some chunks are taken too late if that frame is one that
-has nothing to do with the array. They are not enough for an epoch, so that does not matter.
+A frame that has nothing to do with the array, a GPS fix, say, is handed on between two epochs; one
+that came within an epoch, before it. Such a frame does not know that ingest and assembler have
+taken epochs behind it already.
 
 The kernel finds the epochs. Where it was not built, every frame is handed on alone.
 """
@@ -17,6 +18,7 @@ from enum import IntEnum
 import numpy as np
 
 from risaf_link.core.compiled import native
+from risaf_link.core.fusion import EpochBlock
 from risaf_link.mavlink.choice import PATIENCE_US
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import (
@@ -73,11 +75,11 @@ class BlockReader:
         self._steady: bool | None = None  # None: a frame has been handed on since it was known
         self._finder: native.EpochFinder | None = None
         if native:
-            self._finder = native.EpochFinder(list(self._kinds), JUMP_US, PATIENCE_US)
+            self._finder = native.EpochFinder(
+                list(self._kinds), IDS["IMU_ARRAY_INFO"], JUMP_US, PATIENCE_US
+            )
 
-    def read(
-        self, table: FrameTable, times_us: Stamps
-    ) -> Iterator[RegularEpochs | tuple[Frame, int]]:
+    def read(self, table: FrameTable, times_us: Stamps) -> Iterator[EpochBlock | tuple[Frame, int]]:
         """Read the next frames of a log.
 
         Parameters
@@ -88,7 +90,7 @@ class BlockReader:
 
         Yields
         ------
-        RegularEpochs, or Frame and int
+        EpochBlock, or Frame and int
             What follows next in the log. Ingest and assembler have taken a block already. A frame,
             with its time, must have gone through them when the next item is asked for.
         """
@@ -101,8 +103,14 @@ class BlockReader:
             most = min(self._assembler.until_review, self._longest)
             block = self._block(table, times_us, most)
             if block is not None:
-                yield block
-                if block.row[-1] == len(table) - 1:
+                done = 0
+                for row, before in block.asides:
+                    if done < before:
+                        yield block.part(slice(done, before))
+                    done = before
+                    yield table.frame(row), int(times_us[row])
+                yield block.part(slice(done, None)) if done else block
+                if block.end == len(table):
                     return
                 if len(block) == most:
                     continue
@@ -135,13 +143,13 @@ class BlockReader:
         found = self._finder.take(self._layout, last.time_us, last.sequence, heard_us, most)
         if found is None:
             return None
-        columns, (newest, begun, heard, sequence), unusable, refused = found
+        columns, (newest, begun, heard, last_row), sequence, unusable, refused, asides = found
         time_us = int(columns[0][-1])
-        chunks = (
+        came_newest, came_begun = (
             GyroChunk(source, time_us, int(times_us[row]), 0, NONE, NONE, sequence, info.sensors)
             for row in (newest, begun)
         )
-        block = RegularEpochs(*columns, *chunks)
+        block = RegularEpochs(*columns, came_newest, came_begun, last_row + 1, asides)
         self._ingest.take_block(int(times_us[heard]), *unusable, map(table.frame, refused))
         self._assembler.take_block(block)
         return block
@@ -157,6 +165,7 @@ class BlockReader:
                 source.array_id,
                 native.Sensors(gyros, *info.count_of(is_gyro=True)),
                 native.Sensors(forces, *info.count_of(is_gyro=False)),
+                info.payload,
             )
 
 

@@ -9,6 +9,8 @@ then the vehicle's come too early or too late by as much. Until that is known, t
 both clocks holds as it was.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,11 +21,29 @@ from risaf_link.mavlink.lead import GROSS_US, WINDOW_US, Lead
 from risaf_link.mavlink.timesync import sample_in
 
 SAME_CLOCK_US = 500_000  # clocks that differ by less are one
+MANY = 8  # epochs, or runs of them; fewer cost less one by one
+MOST_UNREAD = 256  # runs of epochs
 DECIDED_US = 2_000_000  # for which epochs are out of the way before it is said why
+
+TELLING = frozenset({IDS["SYSTEM_TIME"], IDS["TIMESYNC"]})
 
 _SYSTEM_TIME = reader("SYSTEM_TIME", "time_unix_usec", "time_boot_ms")
 
 Times = NDArray[np.int64]
+
+
+class _Stamps:
+    """Boot times of some epochs, when they are asked for."""
+
+    def __init__(self, time_us: Times, received_us: Times, catch_up: Callable[[], None]) -> None:
+        self.time_us, self.received_us = time_us, received_us
+        self.boot_us = time_us[:0]  # not known yet
+        self._catch_up = catch_up
+
+    def __call__(self) -> Times:
+        if not len(self.boot_us):
+            self._catch_up()
+        return self.boot_us
 
 
 class VehicleClock:
@@ -37,16 +57,12 @@ class VehicleClock:
     ----------
     component : int
         That of ours which asks with TIMESYNC.
-
-    Attributes
-    ----------
-    delay_us : int
-        By how much samples are older than their stamps say.
     """
 
     def __init__(self, component: int = 191) -> None:
         self._component = component
-        self.delay_us = 0
+        self._delay_us = 0
+        self._unread: list[_Stamps] = []
         self._autopilot: tuple[int, int] | None = None
         self._vehicle, self._array = Lead(), Lead()
         self._other: Lead | None = None  # the array's, of epochs that are out of the way
@@ -60,25 +76,66 @@ class VehicleClock:
     def hear(self, frame: Frame, received_us: int) -> None:
         """Take note of a frame that may tell of an autopilot or of its time."""
         sender = (frame.system, frame.component)
-        if frame.message_id == IDS["HEARTBEAT"]:
-            if self._autopilot is None and autopilot_mode(frame) is not None:
-                self._autopilot = sender
-        elif frame.message_id == IDS["SYSTEM_TIME"] and sender == self._autopilot:
+        is_heartbeat = frame.message_id == IDS["HEARTBEAT"]
+        if is_heartbeat and self._autopilot is None and autopilot_mode(frame) is not None:
+            self._autopilot = sender
+        if frame.message_id not in TELLING or sender != self._autopilot:
+            return
+        self._catch_up()
+        if frame.message_id == IDS["SYSTEM_TIME"]:
             _, boot_ms = _SYSTEM_TIME(frame.payload)
             if self._believes(boot_ms * 1000, received_us):
                 self._vehicle.note(boot_ms * 1000, received_us)
-        elif frame.message_id == IDS["TIMESYNC"] and sender == self._autopilot:
+        else:
             sample = sample_in(frame, self._component, received_us)
             if sample and self._believes(sample.time_us, received_us):
                 self._vehicle.note_answer(sample.time_us, sample.sent_us, received_us)
 
+    @property
+    def delay_us(self) -> int:
+        """By how much samples are older than their stamps say."""
+        return self._delay_us
+
+    @delay_us.setter
+    def delay_us(self, delay_us: int) -> None:
+        self._catch_up()
+        self._delay_us = delay_us
+
     def now_us(self, received_us: int) -> int:
         """What the clock of our stamps shows at a time since 1970; that time, if none is known."""
+        self._catch_up()
         if not self._array.is_known:
             return received_us + (self._vehicle.at(received_us) if self._vehicle.is_known else 0)
         offset_us = self._offset_us if abs(self._offset_us) >= SAME_CLOCK_US else 0
         leads_us = [each.at(received_us) for each in (self._array, self._other) if each]
         return max(received_us + max(leads_us) + offset_us, 0)  # what is late may be held up
+
+    def stamps(self, time_us: Times, received_us: Times) -> Callable[[], Times]:
+        """Do what `boot_us` does for k epochs received one after another, once somebody asks.
+
+        Epochs between which nothing was heard are then taken together: one by one each would cost
+        as much.
+        """
+        stamps = _Stamps(time_us, received_us, self._catch_up)
+        self._unread.append(stamps)
+        if len(self._unread) >= MOST_UNREAD:
+            self._catch_up()
+        return stamps
+
+    def _catch_up(self) -> None:
+        """Take the epochs that nobody has asked for yet."""
+        unread, self._unread = self._unread, []
+        if len(unread) < MANY:
+            for each in unread:
+                each.boot_us = self.boot_times(each.time_us, each.received_us)
+            return
+        time_us = np.concatenate([each.time_us for each in unread])
+        received_us = np.concatenate([each.received_us for each in unread])
+        boot_us = self.boot_times(time_us, received_us)
+        end = 0
+        for each in unread:
+            begin, end = end, end + len(each.time_us)
+            each.boot_us = boot_us[begin:end]
 
     def boot_us(self, time_us: int, received_us: int) -> int:
         """When the samples of an epoch were taken, which has just been received."""
@@ -95,10 +152,13 @@ class VehicleClock:
         self._last = time_us, received_us
         is_same = abs(self._offset_us) < SAME_CLOCK_US
         stamp_us = time_us if is_same else time_us + self._offset_us
-        return self._steady(max(stamp_us - self.delay_us, 0))
+        return self._steady(max(stamp_us - self._delay_us, 0))
 
     def boot_times(self, time_us: Times, received_us: Times) -> Times:
         """Do what `boot_us` does, for k epochs that were received one after another."""
+        if len(time_us) < MANY:
+            epochs = zip(time_us.tolist(), received_us.tolist(), strict=True)
+            return np.array([self.boot_us(*epoch) for epoch in epochs])
         stamps = np.empty(len(time_us), np.int64)
         done = 0
         while done < len(stamps):
@@ -125,7 +185,7 @@ class VehicleClock:
         self._last = int(time_us[-1]), int(received_us[-1])
         same = np.abs(offsets_us) < SAME_CLOCK_US
         stamps_us = np.where(same, time_us, time_us + offsets_us)
-        stamps: Times = np.maximum(stamps_us - self.delay_us, 0)
+        stamps: Times = np.maximum(stamps_us - self._delay_us, 0)
         if (stamps[1:] < stamps[:-1]).any() or stamps[0] < (self._last_us or 0):
             return np.array([self._steady(stamp) for stamp in stamps.tolist()])
         self._last_us = int(stamps[-1])

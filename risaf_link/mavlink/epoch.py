@@ -24,7 +24,6 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
-from numpy.typing import NDArray
 
 from risaf_link.core.fusion import Epoch, EpochBlock
 from risaf_link.core.rotation import Floats
@@ -90,9 +89,10 @@ class GyroChunk(Struct, frozen=True):  # like Frame: there are hundreds a second
 class RegularEpochs(EpochBlock, frozen=True):
     """Epochs in a row, each of which is whole and follows directly on the one before."""
 
-    row: NDArray[np.int64]  # (k,) of the frame that made each whole, in its table
     newest: GyroChunk  # the first of the last epoch; of these two, readings do not matter any more
     begun: GyroChunk  # the first of the last epoch's gyros
+    end: int  # behind the row of the frame that made the last one whole, in its table
+    asides: list[tuple[int, int]]  # rows between, each with the epoch before which it belongs
 
 
 class EpochAssembler:

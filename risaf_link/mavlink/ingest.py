@@ -67,6 +67,7 @@ class ArrayInfo:
     accel_scale: float  # m/s^2 per count; NaN: no accelerometers
     accel_range: float  # m/s^2; inf: not known
     sensors: int  # 0: not known
+    payload: bytes = b""  # that said so; empty: it is assumed
 
     def count_of(self, is_gyro: bool) -> tuple[float, float]:
         """Scale of a count, NaN: not known; and from which magnitude on a reading is saturated."""
@@ -247,6 +248,7 @@ class Ingest:
             accel_scale if 0 < accel_scale < math.inf else math.nan,
             accel_limit if accel_limit > 0 else math.inf,
             sensors,
+            frame.payload,
         )
         _remember(self._infos, (frame.system, frame.component, array_id), info)
 

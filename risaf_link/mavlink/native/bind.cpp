@@ -64,8 +64,9 @@ Array<T> made(std::initializer_list<std::size_t> shape) {
 // Whole epochs out of a table, as block.py wants them.
 class EpochFinder {
  public:
-  EpochFinder(std::vector<std::uint8_t> kinds, std::int64_t jump_us, std::uint64_t patience_us)
-      : finder_(std::move(kinds), jump_us, patience_us) {}
+  EpochFinder(std::vector<std::uint8_t> kinds, std::uint32_t info_id, std::int64_t jump_us,
+              std::uint64_t patience_us)
+      : finder_(std::move(kinds), info_id, jump_us, patience_us) {}
 
   void load(nb::bytes buffer, Column<std::uint8_t> cuts, Column<std::uint64_t> times_us) {
     const std::size_t size = times_us.shape(0);
@@ -87,26 +88,29 @@ class EpochFinder {
     if (size == 0) {
       return nb::none();
     }
-    auto times = made<std::int64_t>({size}), received = made<std::int64_t>({size}),
-         rows = made<std::int64_t>({size});
+    auto times = made<std::int64_t>({size}), received = made<std::int64_t>({size});
     auto dt = made<double>({size});
     for (std::size_t i = 0; i < size; ++i) {
       times.data()[i] = epochs[i].time_us;
       dt.data()[i] = static_cast<double>(epochs[i].time_us - time_us) / 1e6;
       received.data()[i] = static_cast<std::int64_t>(times_us_.data()[epochs[i].end]);
-      rows.data()[i] = static_cast<std::int64_t>(epochs[i].end);
       time_us = epochs[i].time_us;
     }
     auto rates = made<double>({size, array.gyros.count, 3});
     auto forces = made<double>({size, array.accels.count, 3});
     const auto of_gyros = finder_.read(array.gyros, true, rates.data());
     const auto of_accels = finder_.read(array.accels, false, forces.data());
+    nb::list asides;
+    for (const auto& aside : finder_.asides()) {
+      asides.append(nb::make_tuple(aside.row, aside.before));
+    }
     const auto& last = epochs.back();
-    return nb::make_tuple(nb::make_tuple(times, dt, rates, forces, received, rows),
-                          nb::make_tuple(last.newest, last.begun, last.heard, clock.sequence),
+    return nb::make_tuple(nb::make_tuple(times, dt, rates, forces, received),
+                          nb::make_tuple(last.newest, last.begun, last.heard, last.end),
+                          clock.sequence,
                           nb::make_tuple(of_gyros.invalid + of_accels.invalid,
                                          of_gyros.saturated + of_accels.saturated),
-                          finder_.refused());
+                          finder_.refused(), asides);
   }
 
   std::size_t single() { return finder_.single(); }
@@ -129,11 +133,17 @@ void bind_frames(nb::module_& m) {
   nb::class_<risaf::Sensors>(m, "Sensors")
       .def(nb::init<std::size_t, double, double>(), "count"_a, "scale"_a, "limit"_a);
   nb::class_<risaf::ArrayLayout>(m, "ArrayLayout")
-      .def(nb::init<std::uint8_t, std::uint8_t, std::uint8_t, risaf::Sensors, risaf::Sensors>(),
-           "system"_a, "component"_a, "array_id"_a, "gyros"_a, "accels"_a);
+      .def("__init__",
+           [](risaf::ArrayLayout* self, std::uint8_t system, std::uint8_t component,
+              std::uint8_t array_id, risaf::Sensors gyros, risaf::Sensors accels, nb::bytes told) {
+             const auto* begin = data(told);
+             new (self) risaf::ArrayLayout{system, component, array_id, gyros, accels,
+                                           {begin, begin + told.size()}};
+           },
+           "system"_a, "component"_a, "array_id"_a, "gyros"_a, "accels"_a, "told"_a);
   nb::class_<EpochFinder>(m, "EpochFinder")
-      .def(nb::init<std::vector<std::uint8_t>, std::int64_t, std::uint64_t>(), "kinds"_a,
-           "jump_us"_a, "patience_us"_a)
+      .def(nb::init<std::vector<std::uint8_t>, std::uint32_t, std::int64_t, std::uint64_t>(),
+           "kinds"_a, "info_id"_a, "jump_us"_a, "patience_us"_a)
       .def("load", &EpochFinder::load, "buffer"_a, "cuts"_a, "times_us"_a)
       .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a,
            "heard_us"_a, "most"_a)

@@ -28,6 +28,7 @@ struct Sensors {
 struct ArrayLayout {
   std::uint8_t system, component, array_id;
   Sensors gyros, accels;
+  std::vector<std::uint8_t> told;  // payload of its last IMU_ARRAY_INFO; empty: there was none
 };
 
 // How the last epoch ended, and this one may go on.
@@ -41,6 +42,11 @@ struct EpochRows {
   std::int64_t time_us;
 };
 
+// A frame that stands between epochs, or within one, and bears on none of them.
+struct Aside {
+  std::size_t row, before;  // index of the epoch before which it is to be handed on
+};
+
 struct Unusable {
   std::size_t invalid = 0, saturated = 0;
 };
@@ -51,10 +57,11 @@ class EpochFinder {
   static constexpr std::size_t HEAD = 12, COUNT = 252, ARRAY_ID = 253, CAPACITY = 40;
   static constexpr std::int16_t INVALID = -32768;
 
-  // `kinds` by message id; `jump_us`: a step that is no usual one; `patience_us`: for how long an
-  // array may be silent without another being listened to.
-  EpochFinder(std::vector<std::uint8_t> kinds, std::int64_t jump_us, std::uint64_t patience_us)
-      : kinds_(std::move(kinds)), jump_us_(jump_us), patience_us_(patience_us) {}
+  // `kinds` by message id; `info_id`: of IMU_ARRAY_INFO; `jump_us`: a step that is no usual one;
+  // `patience_us`: for how long an array may be silent without another being listened to.
+  EpochFinder(std::vector<std::uint8_t> kinds, std::uint32_t info_id, std::int64_t jump_us,
+              std::uint64_t patience_us)
+      : kinds_(std::move(kinds)), info_id_(info_id), jump_us_(jump_us), patience_us_(patience_us) {}
 
   // Begin with a table, which must outlive its use.
   void load(const std::uint8_t* buffer, const Cut* cuts, const std::uint64_t* times_us,
@@ -63,24 +70,27 @@ class EpochFinder {
     cuts_ = cuts;
     times_us_ = times_us;
     size_ = size;
-    at_ = handed_ = 0;
-    aside_ = NOWHERE;
+    at_ = 0;
   }
 
-  // Take whole epochs, up to the first frame that is not as usual, or that must be handed on between
-  // two of them. They stay known until the next call; `clock` is that of the last one, then.
+  // Take whole epochs, up to the first frame that is not as usual. They stay known until the next
+  // call; `clock` is that of the last one, then.
   const std::vector<EpochRows>& take(const ArrayLayout& array, Clock* clock,
                                      std::uint64_t heard_us, std::size_t most) {
     epochs_.clear();
     chunks_.clear();
     refused_.clear();
-    aside_ = NOWHERE;
+    asides_.clear();
     EpochRows epoch{};
     Clock now = *clock;
     std::size_t whole_chunks = 0, gyros = 0, forces = 0;
     for (std::size_t row = at_; row < size_ && epochs_.size() < most; ++row) {
       const Kind kind = kind_of(row);
-      if (kind == IGNORED || (kind == ASIDE && row < handed_)) {
+      if (kind == IGNORED) {
+        continue;
+      }
+      if (kind == ASIDE || (kind == APART && repeats(array, row))) {
+        asides_.push_back({row, epochs_.size()});
         continue;
       }
       if (kind == REFUSED && apart(times_us_[row], heard_us) <= patience_us_) {
@@ -88,9 +98,6 @@ class EpochFinder {
         continue;
       }
       Chunk chunk;
-      if (kind == ASIDE) {
-        aside_ = row;
-      }
       if (kind < GYROS || !read(array, row, kind == GYROS, &chunk)) {
         break;
       }
@@ -133,8 +140,14 @@ class EpochFinder {
     while (!refused_.empty() && refused_.back() >= at_) {
       refused_.pop_back();
     }
+    while (!asides_.empty() && asides_.back().row >= at_) {
+      asides_.pop_back();
+    }
     return epochs_;
   }
+
+  // What stood between the epochs that were taken and is to be handed on there.
+  const std::vector<Aside>& asides() const { return asides_; }
 
   // What stood between the epochs that were taken and is not listened to.
   const std::vector<std::size_t>& refused() const { return refused_; }
@@ -153,14 +166,9 @@ class EpochFinder {
 
   // The next frame that is to be handed on alone; the size of the table: there is none.
   std::size_t single() {
-    if (aside_ != NOWHERE) {
-      handed_ = aside_ + 1;
-      return std::exchange(aside_, NOWHERE);
-    }
     while (at_ < size_) {
       const std::size_t row = at_++;
-      const Kind kind = kind_of(row);
-      if (kind != IGNORED && (kind != ASIDE || row >= handed_)) {
+      if (kind_of(row) != IGNORED) {
         return row;
       }
     }
@@ -168,8 +176,6 @@ class EpochFinder {
   }
 
  private:
-  static constexpr std::size_t NOWHERE = std::numeric_limits<std::size_t>::max();
-
   struct Chunk {
     bool is_gyro;
     std::size_t epoch, first, count;
@@ -182,6 +188,14 @@ class EpochFinder {
   Kind kind_of(std::size_t row) const {
     const std::uint32_t message_id = cuts_[row].message_id;
     return message_id < kinds_.size() ? static_cast<Kind>(kinds_[message_id]) : IGNORED;
+  }
+
+  // Whether a frame is an IMU_ARRAY_INFO that says what the array's last one said.
+  bool repeats(const ArrayLayout& array, std::size_t row) const {
+    const Cut& cut = cuts_[row];
+    return cut.message_id == info_id_ && cut.system == array.system &&
+           cut.component == array.component && cut.size > 0 && cut.size == array.told.size() &&
+           std::memcmp(buffer_ + cut.payload(), array.told.data(), cut.size) == 0;
   }
 
   template <typename T>
@@ -239,18 +253,18 @@ class EpochFinder {
   }
 
   std::vector<std::uint8_t> kinds_;
+  std::uint32_t info_id_;
   std::int64_t jump_us_;
   std::uint64_t patience_us_;
   const std::uint8_t* buffer_ = nullptr;
   const Cut* cuts_ = nullptr;
   const std::uint64_t* times_us_ = nullptr;
   std::size_t size_ = 0;
-  std::size_t at_ = 0;          // all before it is done with
-  std::size_t handed_ = 0;      // before it, what is ASIDE
-  std::size_t aside_ = NOWHERE;  // where `take` has stopped, if at such a frame
+  std::size_t at_ = 0;  // all before it is done with
   std::vector<EpochRows> epochs_;
   std::vector<Chunk> chunks_;
   std::vector<std::size_t> refused_;
+  std::vector<Aside> asides_;
 };
 
 }  // namespace risaf
