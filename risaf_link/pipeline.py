@@ -22,8 +22,8 @@ from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.memory import ArrayIdentity, Memory
 from risaf_link.core.rotation import Floats
-from risaf_link.core.track import RESETS, WALK
-from risaf_link.core.warm import Trial
+from risaf_link.core.track import WALK, Track
+from risaf_link.core.warm import WarmStart
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
@@ -61,8 +61,6 @@ class Pipeline:
     mismatch : str
         Why the calibration is not that of the array which sends, in one line; there are no
         estimates from such epochs. Empty: all is well.
-    recalled : str
-        What came of the memory, in one line; empty: there is none, or it is not known yet.
     """
 
     def __init__(
@@ -78,17 +76,17 @@ class Pipeline:
         clocks = {IDS["SYSTEM_TIME"], IDS["TIMESYNC"]}
         self._decisive = self.ingest.message_ids - SAMPLES | clocks
         self.assembler = EpochAssembler(structs.replace(p.array, sensors=sensors))
-        self.mismatch = self.recalled = ""
+        self.mismatch = ""
         self._calibration = Calibration(calibration) if calibration else None
         self._checksum = crc32(msgspec.json.encode(calibration)) if calibration else 0
         self._clock = VehicleClock(own[1])
         self._parameters = p
         self._delay = 0.0  # s, of the samples
-        self._estimator = Estimator(p.fusion, p.attitude, p.heading)
+        estimator = Estimator(p.fusion, p.attitude, p.heading)
+        self._start = WarmStart(estimator, memory, self._identity)
         self._finder = HeadingFinder(p.heading)
         self._monitor = HeadingMonitor(p.heading)
         self._waiting: list[tuple[Epoch, int]] = []
-        self._trial = Trial(memory) if memory else None
         self._latest: EstimateBlock | None = None
 
     def configure(self, parameters: PipelineParameters) -> None:
@@ -104,15 +102,15 @@ class Pipeline:
 
     def restart(self) -> None:
         """Start the attitude filter, and what judges its headings, anew; the array stays known."""
-        self._give_up("state ignored: the filter was started anew")
-        self._estimator.restart()
+        self._start.give_up("the filter was started anew")
+        self._start.estimator.restart()
         self._finder = HeadingFinder(self._parameters.heading)
         self._monitor = HeadingMonitor(self._parameters.heading)
 
     def set_bias(self, rate_b: Floats, variance: Floats) -> None:
         """Believe the mean fused rate of a vehicle at rest, (3,) rad/s, and its variance."""
-        self._give_up("state ignored: the bias was set anew")
-        self._estimator.set_bias(rate_b, variance)
+        self._start.give_up("the bias was set anew")
+        self._start.estimator.set_bias(rate_b, variance)
 
     def memory(self) -> Memory | None:
         """Tell what is known, so that it outlasts a restart; None: it is not worth it, or not yet.
@@ -121,14 +119,19 @@ class Pipeline:
         filters than `eskf` nothing can be told.
         """
         latest = self._latest
-        if latest is None or self._trial:
+        if latest is None or self._start.is_on_trial:
             return None
-        parts = self._estimator.memory(latest.track.values[-1, WALK].copy())
+        parts = self._start.estimator.memory(latest.track.values[-1, WALK].copy())
         if parts is None:
             return None
         gyros, accelerometers, attitude = parts
         times = int(latest.time_us[-1]), int(latest.received_us[-1])
         return Memory(self._identity(len(gyros)), *times, gyros, accelerometers, attitude)
+
+    @property
+    def recalled(self) -> str:
+        """What came of the memory, in one line; empty: there is none, or it is not known yet."""
+        return self._start.outcome
 
     def adopt(self, own: tuple[int, int]) -> None:
         """Take note that this service has other ids now."""
@@ -194,14 +197,13 @@ class Pipeline:
         delay = self.ingest.delay_of(self.assembler.source)
         if delay != self._delay:
             self._set_delay(delay)
-        return self._continue(epochs)
+        return [self._told(*part) for part in self._start.advance(epochs)]
 
-    def _carry_on(self, epochs: EpochBlock) -> EstimateBlock:
-        track, elapsed = self._estimator.advance(epochs.dt, epochs.rates_b, epochs.forces_b)
+    def _told(self, epochs: EpochBlock, track: Track, elapsed: Floats) -> EstimateBlock:
         self._latest = EstimateBlock(
             epochs.time_us,
             epochs.received_us,
-            self._clock.boot_times(epochs.time_us, epochs.received_us),
+            self._clock.stamps(epochs.time_us, epochs.received_us),
             self._clock.delay_us,
             elapsed,
             track,
@@ -210,44 +212,19 @@ class Pipeline:
         )
         return self._latest
 
-    def _try(self, trial: Trial, epochs: EpochBlock) -> list[EstimateBlock]:
-        """Carry the estimate on while a memory is on trial, and judge it when that is over."""
-        share = trial.share(epochs.dt)
-        tried, rest = epochs.part(slice(share)), epochs.part(slice(share, None))
-        trial.note_epochs(tried, self._estimator.elapsed)
-        blocks = [self._carry_on(tried)]
-        if trial.is_over:
-            self._judge(trial, int(blocks[0].track.values[-1, RESETS]))
-        return [*blocks, *self._continue(rest)] if len(rest) else blocks
-
-    def _continue(self, epochs: EpochBlock) -> list[EstimateBlock]:
-        return self._try(self._trial, epochs) if self._trial else [self._carry_on(epochs)]
-
-    def _judge(self, trial: Trial, resets: int) -> None:
-        found = self._identity(trial.memory.array.sensors)
-        if found != trial.memory.array:
-            self._give_up(f"state ignored: {_difference(found, trial.memory.array)}")
-            return
-        verdict = trial.judge(self._in_force(), resets)
-        self._give_up(verdict.text)
-        self._estimator = verdict.estimator or self._estimator
-
-    def _give_up(self, text: str) -> None:
-        """End the trial, if there is one."""
-        if self._trial:
-            self._trial, self.recalled = None, text
-
     def _identity(self, sensors: int) -> ArrayIdentity:
+        """Which array sends, if it has so many gyros."""
         source = self.assembler.source
         info = source and self.ingest.info(source)
         encoding, array_id = (source.encoding, source.array_id) if source else ("", 0)
-        return ArrayIdentity(encoding, array_id, info.name if info else "", sensors, self._checksum)
+        name = info.name if info else ""
+        return ArrayIdentity(encoding, array_id, name, sensors, self._checksum)
 
     def _set_delay(self, delay: float) -> None:
         """Take samples for so many seconds old: a fix is less late than against present ones."""
         self._delay = delay
         self._clock.delay_us = round(delay * 1e6)
-        self._estimator.configure(*self._in_force())
+        self._start.estimator.configure(*self._in_force())
 
     def _in_force(self) -> tuple[FusionParameters, AttitudeParameters, HeadingParameters]:
         """Parameters of the estimator."""
@@ -257,11 +234,9 @@ class Pipeline:
 
     def _correct(self, fix: GpsFix) -> None:
         """Correct the attitude by a GPS fix."""
-        motion = self._finder.take(fix, self._estimator.elapsed)
+        motion = self._finder.take(fix, self._start.estimator.elapsed)
         self._monitor.note_motion(motion)
-        if self._trial:
-            self._trial.note_fix(motion, fix.latitude)
-        innovation = self._estimator.correct(motion, fix.latitude)
+        innovation = self._start.correct(motion, fix.latitude)
         if innovation and motion.heading:
             self._monitor.note_innovation(motion.heading, innovation)
 
@@ -273,7 +248,7 @@ class Pipeline:
             counts["incomplete"],
             counts["samples_lost"],
             sensors,
-            self._estimator.fusion.health(),
+            self._start.estimator.fusion.health(),
         )
 
     def _fits(self, sensors: int) -> bool:
@@ -285,12 +260,3 @@ class Pipeline:
             max(sensors, info.sensors if info else 0), info.name if info else ""
         )
         return not self.mismatch
-
-
-def _difference(found: ArrayIdentity, expected: ArrayIdentity) -> str:
-    """What tells two arrays apart, in words."""
-    for name in ("encoding", "id", "name", "calibration"):
-        ours, theirs = getattr(found, name), getattr(expected, name)
-        if ours != theirs:
-            return f"array's {name}: found {ours!r}, expected {theirs!r}"
-    return "another array"

@@ -58,6 +58,11 @@ class Estimator:
         self._resets = 0  # of yaw, by the filters before this one
         self._begin()
 
+    @property
+    def parameters(self) -> tuple[FusionParameters, AttitudeParameters, HeadingParameters]:
+        """What is in force."""
+        return self._parameters
+
     def restart(self) -> None:
         """Start the filter, and what aids and guards it, anew; the array stays known."""
         self._resets += self._filter.state(0).resets

@@ -136,6 +136,14 @@ class ArrayIdentity(Struct, frozen=True, forbid_unknown_fields=True):
     sensors: int
     calibration: int  # a checksum; 0: none
 
+    def difference(self, found: "ArrayIdentity") -> str:
+        """What tells another array from this one, in words; empty: nothing."""
+        for name in ("encoding", "id", "name", "calibration", "sensors"):
+            ours, theirs = getattr(self, name), getattr(found, name)
+            if ours != theirs:
+                return f"array's {name}: found {theirs!r}, expected {ours!r}"
+        return ""
+
 
 class Memory(Struct, frozen=True, forbid_unknown_fields=True):
     """What is known at one epoch."""

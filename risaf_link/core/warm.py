@@ -5,18 +5,20 @@ says so; what comes in is kept. Then what is remembered is held against it, and 
 through once more with the same second: no estimate ever rests on a memory that has failed.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
 
-from risaf_link.core.attitude import AttitudeParameters
+from risaf_link.core.attitude import AttitudeParameters, Innovation
 from risaf_link.core.estimator import Estimator
 from risaf_link.core.fusion import EpochBlock, FusionParameters
 from risaf_link.core.heading import HeadingParameters, Motion
 from risaf_link.core.interruption import Interruption
-from risaf_link.core.memory import FilterMemory, Memory
+from risaf_link.core.memory import ArrayIdentity, FilterMemory, Memory
 from risaf_link.core.rotation import Floats
+from risaf_link.core.track import RESETS, Track
 
 TRIAL = 1.0  # s, in which what is remembered is held against what comes
 FEWEST = 5  # epochs that it takes
@@ -122,6 +124,78 @@ class Trial:
         for _, alike in groupby(self._events, _kind):
             _pass(warm, list(alike))
         return Verdict(_told(known, interruption.age), warm)
+
+
+class WarmStart:
+    """An estimator that goes on from a memory when that has stood its trial.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        One that knows nothing.
+    memory : Memory or None
+    identify : callable
+        Says which array sends, from the number of its gyros.
+
+    Attributes
+    ----------
+    estimator : Estimator
+        Whose estimates hold now.
+    outcome : str
+        What came of the memory, in one line; empty: there is none, or it is not known yet.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        memory: Memory | None,
+        identify: Callable[[int], ArrayIdentity],
+    ) -> None:
+        self.estimator = estimator
+        self.outcome = ""
+        self._trial = Trial(memory) if memory else None
+        self._identify = identify
+
+    @property
+    def is_on_trial(self) -> bool:
+        """Whether it is not known yet what becomes of the memory."""
+        return self._trial is not None
+
+    def give_up(self, why: str) -> None:
+        """End the trial, if there is one."""
+        if self._trial:
+            self._trial, self.outcome = None, f"state ignored: {why}"
+
+    def advance(self, epochs: EpochBlock) -> list[tuple[EpochBlock, Track, Floats]]:
+        """Carry the estimate on, as `Estimator.advance` does; the trial ends between two parts."""
+        trial = self._trial
+        share = trial.share(epochs.dt) if trial else len(epochs)
+        part, rest = epochs, None
+        if share < len(epochs):
+            part, rest = epochs.part(slice(share)), epochs.part(slice(share, None))
+        if trial:
+            trial.note_epochs(part, self.estimator.elapsed)
+        track, elapsed = self.estimator.advance(part.dt, part.rates_b, part.forces_b)
+        if trial and trial.is_over:
+            self._judge(trial, int(track.values[-1, RESETS]))
+        done = [(part, track, elapsed)]
+        return done if rest is None else done + self.advance(rest)
+
+    def correct(self, motion: Motion, latitude: float) -> Innovation | None:
+        """Use what a fix says, as `Estimator.correct` does."""
+        if self._trial:
+            self._trial.note_fix(motion, latitude)
+        return self.estimator.correct(motion, latitude)
+
+    def _judge(self, trial: Trial, resets: int) -> None:
+        known = trial.memory.array
+        difference = known.difference(self._identify(known.sensors))
+        if difference:
+            self.give_up(difference)
+            return
+        verdict = trial.judge(self.estimator.parameters, resets)
+        self._trial, self.outcome = None, verdict.text
+        self.estimator = verdict.estimator or self.estimator
 
 
 def _kind(event: Event) -> tuple[int, ...]:
