@@ -1,4 +1,4 @@
-"""How the pages in this directory become a site: `sphinx-build -W docs out/docs`.
+"""How the pages in this directory become a site: `sphinx-build -W -E docs out/docs`.
 
 The pages are plain Markdown, to be read in the repository as well; what only the site has, its list
 of pages and whole files, is put in for comments here.
@@ -19,6 +19,9 @@ PAGES = {
     "Know it": ["faults", "threats", "routers", "architecture"],
 }
 """Captions to their pages, in order. A page that stands nowhere here is an error of the build."""
+
+OUTSIDE = re.compile(r"\]\((\.\./[^)#]+\.md)(?:#[^)]*)?\)")
+"""Links to Markdown that is no page of the site: a file like any other."""
 
 project = "risaf_link"
 author = "The risaf_link authors"
@@ -44,6 +47,7 @@ def put_in(app: Any, name: str, source: list[str]) -> None:
     del app, name
     source[0] = source[0].replace("<!-- pages -->", contents())
     source[0] = re.sub(r"<!-- whole: (\S+) (\w+) -->", whole, source[0])
+    source[0] = OUTSIDE.sub(r"](path:\1)", source[0])
 
 
 def contents() -> str:

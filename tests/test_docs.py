@@ -1,4 +1,4 @@
-"""What the pages name is there: files, headings, keys, commands with their options, messages."""
+"""What the pages name is there: files, headings, keys, commands with their options."""
 
 import re
 import shlex
@@ -17,7 +17,7 @@ PAGES = sorted(ROOT.glob("docs/*.md"))
 TEXTS = [*PAGES, *(ROOT / name for name in ("README.md", "benchmarks/README.md"))]
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)(?:#([^)\s]+))?\)")
 KEY = re.compile(
-    r"`((?:array|gps|fusion|heading|attitude|mavlink|state|mqtt|metrics)\.(?!json)[a-z_]+)`"
+    r"`((?:array|gps|fusion|heading|attitude|mavlink|state|mqtt|metrics)\.(?!json|py)[a-z_]+)`"
 )
 
 
