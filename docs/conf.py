@@ -13,10 +13,10 @@ from risaf_link import __version__
 HERE = Path(__file__).parent
 
 PAGES = {
-    "Set it up": ["install", "configure", "px4", "ardupilot"],
+    "Set it up": ["Install <install>", "configure", "PX4 <px4>", "ArduPilot <ardupilot>"],
     "Use it": ["mavlink", "mavproxy", "monitor", "recording", "mqtt", "metrics"],
     "Judge it": ["looking-back", "tune", "troubleshoot"],
-    "Know it": ["faults", "threats", "routers", "architecture"],
+    "Know it": ["architecture", "faults", "threats", "routers"],
 }
 """Captions to their pages, in order. A page that stands nowhere here is an error of the build."""
 
@@ -32,7 +32,6 @@ exclude_patterns = ["_*"]
 nitpicky = True
 
 myst_heading_anchors = 3  # as the forge makes them
-myst_enable_extensions = ["html_image"]
 
 html_theme = "furo"
 html_title = f"risaf_link {version}"
@@ -54,10 +53,15 @@ def contents() -> str:
     """The list of pages."""
     trees = []
     for caption, pages in PAGES.items():
-        there = [page for page in pages if (HERE / f"{page}.md").exists()]
+        there = [page for page in pages if (HERE / f"{name_in(page)}.md").exists()]
         head = f"```{{toctree}}\n:hidden:\n:caption: {caption}\n\n"
         trees.append(head + "\n".join(there) + "\n```\n")
     return "\n".join(trees)
+
+
+def name_in(page: str) -> str:
+    """A page's name, behind the title if it has another one here."""
+    return page.partition("<")[2].rstrip(">") or page
 
 
 def whole(found: re.Match[str]) -> str:
