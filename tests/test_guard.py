@@ -46,12 +46,13 @@ class Ride:
         self.finder = HeadingFinder(self.parameters)
         self.generator = np.random.default_rng(seed)
         self.yaw, self.north, self.east, self.speed, self.time = yaw, 0.0, 0.0, 0.0, 0.0
+        self.bias = 0.0  # rad/s, of the rate about the vertical
         self.antenna, self.late = antenna, deque(maxlen=max(round(delay / DT), 1) + 1)
         self.errors, self.ratios, self.innovations = [], [], []
         self.predict(0.0)
 
     def predict(self, rate):
-        rate_b = np.array([0.0, 0.0, rate]) + GYRO_NOISE * self.generator.normal(size=3)
+        rate_b = np.array([0.0, 0.0, rate + self.bias]) + GYRO_NOISE * self.generator.normal(size=3)
         noise = np.full(3, GYRO_NOISE**2)
         walk = np.full(3, 5e-6)
         self.filter.predict(FusedRate(0, rate_b, noise, np.full(3, 1), 1, noise, walk), DT)
@@ -399,6 +400,17 @@ def test_after_an_outage_headings_that_agree_set_yaw_within_ten_seconds():
     ride.go(2.0, 0.05)
     assert ride.resets == 2
     assert abs(math.degrees(ride.errors[-1])) < 3.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bias_that_is_not_known_yet_does_not_lock_headings_out(seed):
+    ride = Ride(HeadingParameters(gate=1.5), seed=seed)
+    ride.bias = 4.0 * AttitudeParameters().initial_bias_std
+    ride.go(10.0, gain=1.0).go(120.0)
+    ride.forget()
+    ride.go(60.0)
+    assert np.mean(ride.used) > 0.8
+    assert ride.error < 5.0
 
 
 def test_yaw_gets_less_certain_while_headings_are_refused():

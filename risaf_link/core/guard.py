@@ -10,8 +10,8 @@ that is right. So the headings are judged together.
   in one innovation.
 - Headings that the receiver's own positions contradict are not used.
 - Yaw is set anew by rejected headings only if they agree with one another and with the gyros, which
-  is to say if they are all off by the same angle, and if they do so for as long as yaw was
-  confirmed before: ten seconds of headings do not outweigh minutes.
+  is to say if they are all off by the same angle, as far as the gyros' bias is known, and if they
+  do so for as long as yaw was confirmed before: ten seconds of headings do not outweigh minutes.
 - The course of a vehicle in reverse is turned round.
 """
 
@@ -27,7 +27,7 @@ from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
 from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
 from risaf_link.core.rotation import Floats, wrap, wraps
-from risaf_link.core.track import Track
+from risaf_link.core.track import BIAS_STD, Track
 
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
 MEMORY = 15  # innovations in a mean
@@ -36,6 +36,7 @@ MEAN_GATE = 4.0  # standard deviations of the mean beyond which headings are rej
 MEAN_TRUST = 2.5  # and within which they are trusted again
 LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
+BIAS_GATE = 5.0  # standard deviations by which the bias may be off, for the gyros to agree
 AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
 RATES = 1024  # epochs; a second at 1 kHz
 ROOM = 4 * RATES  # so that room has to be made only now and then
@@ -121,8 +122,16 @@ class Dispute:
         while time_s - self._rejected[0][0] > self.longest:
             self._rejected.popleft()
 
-    def is_won(self, after: float) -> bool:
-        """Whether the headings have agreed for so many seconds that they are all off alike."""
+    def is_won(self, after: float, drift: float) -> bool:
+        """Whether the headings have agreed for so many seconds that they are all off alike.
+
+        Parameters
+        ----------
+        after : float
+            s.
+        drift : float
+            rad/s, by which yaw may have turned away from them as long: the gyros' bias.
+        """
         last_s, last_error, _ = self._rejected[-1]
         if last_s - self._since < after:
             return False
@@ -136,10 +145,10 @@ class Dispute:
         noise = math.sqrt(float(variances.mean()))
         apart = abs(float(halves[0].mean() - halves[1].mean()))
         spread = math.sqrt(sum(float(half.var()) * len(half) for half in halves) / len(errors))
-        return (
-            apart < AGREEMENT + 6.0 * noise / math.sqrt(len(errors))
-            and spread < AGREEMENT + 2.0 * noise
-        )
+        drifted = drift * after / 2.0  # from half to half
+        return apart < AGREEMENT + 6.0 * noise / math.sqrt(
+            len(errors)
+        ) + drifted and spread < AGREEMENT + 2.0 * noise + drifted / math.sqrt(12.0)
 
 
 class HeadingGuard:
@@ -169,6 +178,7 @@ class HeadingGuard:
         self._turned = np.zeros((ROOM, 4))  # rad, the rate's integral in body axes; s
         self._turns = 1  # how many of them are known
         self._aligned = False
+        self._bias_std = 0.0  # rad/s, on the axis on which it is largest
         self._confirmed = 0.0  # s for which headings have agreed with yaw
         self._is_hearsay = False  # yaw is remembered, and no heading has agreed with it since
 
@@ -208,6 +218,7 @@ class HeadingGuard:
         self.gear.feel(track.ahead, dt)
         self._elapsed = float(elapsed[-1])
         self._aligned = bool(track.aligned[-1])
+        self._bias_std = float(track.values[-1, BIAS_STD].max())
 
     def _turn(self, rate_b: Floats, elapsed: Floats, dt: Floats) -> None:
         """Go on with the rate's integral."""
@@ -278,7 +289,8 @@ class HeadingGuard:
                     self._whiteness.note_fused(compared, measured[1])
                     return self._fuse(estimator, motion, measured, pause)
             self._dispute.add(self._elapsed, compared.value, measured[1])
-            if self._dispute.is_won(self._patience(compared, motion.speed)):
+            drift = BIAS_GATE * self._bias_std
+            if self._dispute.is_won(self._patience(compared, motion.speed), drift):
                 return self._set(estimator.reset_heading, measured)
         self._whiteness.note_refused()
         return Refused(compared.value, compared.variance, gate)
