@@ -78,7 +78,7 @@ async def demo(
         }
         tell("service  risaf-link run")
         tell("vehicle  simulated: 120 gyros, shocked at times; some fall silent and come back;")
-        tell("         40 s of every 2 minutes without GPS")
+        tell("         40 s of every 2 minutes without GPS, 15 s of every 4 with a wrong course")
         tell(f"MAVLink  any ground station on UDP port {GROUND_PORT} sees it as well")
         if broker:
             tell(f"MQTT     mosquitto_sub -p {broker_port} -v -t 'risaf/{NAME}/#'")
