@@ -2,7 +2,8 @@
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -122,6 +123,17 @@ def rooted(command: Command) -> Command:
         metavar="DIR",
         help="Root directory of an image, where nothing is started.  [default: this system]",
     )(command)
+
+
+def interrupted(command: Callable[..., None]) -> Callable[..., None]:
+    """Take Ctrl-C for the end that it is, also before the command has quite begun."""
+
+    @wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        with suppress(KeyboardInterrupt):
+            command(*args, **kwargs)
+
+    return run
 
 
 @contextmanager

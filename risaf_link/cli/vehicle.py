@@ -6,12 +6,21 @@ from typing import Any
 
 import click
 
-from risaf_link.cli.options import configured, extra, listening, opened, progress_over, rooted
+from risaf_link.cli.options import (
+    configured,
+    extra,
+    interrupted,
+    listening,
+    opened,
+    progress_over,
+    rooted,
+)
 
 
 @click.command()
 @configured
 @click.option("-v", "--verbose", is_flag=True, help="Say more, such as which peers come and go.")
+@interrupted
 def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> None:
     """Run the service until it is interrupted.
 
@@ -159,6 +168,7 @@ def simulate(
 @click.command()
 @click.argument("source", metavar="URL|LOG")
 @listening
+@interrupted
 def monitor(source: str, listen: tuple[str, int]) -> None:
     """Show vehicles on a page in the browser: live from a link, or from a log.
 
@@ -199,6 +209,7 @@ def _tell_page(url: str) -> None:
 @click.command()
 @click.option("--seed", type=int, default=1, metavar="N", help="Of the drive and its faults.")
 @listening
+@interrupted
 def demo(seed: int, listen: tuple[str, int]) -> None:
     """Show it all without hardware: a simulated vehicle, the service, and the page.
 
