@@ -8,6 +8,7 @@ from itertools import count
 import msgspec
 import numpy as np
 import pytest
+from aiohttp import ClientSession
 from aiohttp.test_utils import TestClient, TestServer
 from test_monitor import LEVEL, NOW_US, STATUS, taken, told
 from wire import SERVICE, frame
@@ -230,6 +231,16 @@ async def test_another_name_for_this_machine_is_refused(recording):
         assert (await client.get("/", headers={"Host": "localhost:8765"})).status == 200
     async with browsing(Log("drive.tlog", Player(recording)), host="10.0.0.7") as client:
         assert (await client.get("/", headers={"Host": "boat.local"})).status == 200
+
+
+async def test_a_page_on_ipv6_tells_a_url_that_a_browser_takes(recording):
+    urls: asyncio.Queue[str] = asyncio.Queue()
+    source = Log("drive.tlog", Player(recording))
+    serving = asyncio.create_task(serve(source, "::1", 0, urls.put_nowait))
+    async with ClientSession() as session, session.get(await urls.get()) as page:
+        assert page.status == 200
+    serving.cancel()
+    await asyncio.wait([serving])
 
 
 async def test_a_port_that_is_taken_is_said_in_one_line(recording):

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import click
 
+from risaf_link.address import address_in
 from risaf_link.errors import ConfigError, RisafError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -45,10 +46,10 @@ class Address(click.ParamType[Any]):
         """Read it."""
         if isinstance(value, tuple):
             return value
-        host, _, port = value.rpartition(":")
-        if not host or not port.isdecimal() or int(port) > 65535:
+        found = address_in(value)
+        if found is None:
             self.fail(f"found {value!r}, expected ADDRESS:PORT, such as 0.0.0.0:8765", param, ctx)
-        return host, int(port)
+        return found
 
 
 def configured(command: Command) -> Command:

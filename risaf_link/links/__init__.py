@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from risaf_link.address import HOST
 from risaf_link.errors import LinkError
 from risaf_link.links.link import Link, LinkCounts, Receive
 from risaf_link.links.memory import MemoryLink
@@ -27,8 +28,7 @@ __all__ = [
     "open_link",
 ]
 
-_LABEL = r"[A-Za-z0-9_-]{1,63}"
-_HOST_PORT = rf"({_LABEL}(?:\.{_LABEL})*|\[[0-9A-Fa-f:.]+(?:%\w+)?\]):([0-9]{{1,9}})"
+_HOST_PORT = rf"({HOST}):([0-9]{{1,9}})"
 _FORMS = {
     "serial": ("serial:///dev/NAME:BAUD", r"(/.+):([0-9]{1,9})"),
     "udpin": ("udpin://ADDRESS:PORT", _HOST_PORT),
