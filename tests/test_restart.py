@@ -10,10 +10,10 @@ import time
 
 import numpy as np
 import pytest
+from daemon import SAFETY_S, Running, bursts, config_for, feed, outputs, replayed
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
-from test_service import SAFETY_S, Ground, Running, bursts, config_for, feed, outputs, replayed
 from vehicle import Vehicle
 
 from risaf_link.config import Config, StateParameters
@@ -27,14 +27,6 @@ from risaf_link.sim.scenario import scenario
 from risaf_link.sim.stream import frames
 
 SENSORS, NOISE, BIAS = 12, 1e-3, 5e-3  # rad/s
-
-
-@pytest.fixture
-async def ground():
-    loop = asyncio.get_running_loop()
-    transport, protocol = await loop.create_datagram_endpoint(Ground, local_addr=("127.0.0.1", 0))
-    yield protocol
-    transport.close()
 
 
 def free_port():

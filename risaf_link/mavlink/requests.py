@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, get_args
 from msgspec import Meta
 
 from risaf_link.mavlink.commands import Command, Peer, Result
-from risaf_link.mavlink.dialect import IDS, MESSAGES, reader
+from risaf_link.mavlink.dialect import IDS, MESSAGES, reader, text_of
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.identity import autopilot_mode
 
@@ -247,7 +247,7 @@ class Requests:
         return self._at
 
     def _hear_array(self, frame: Frame) -> None:
-        is_gyro = _DEBUG(frame.payload)[0].rstrip(b"\0") == b"gyro"
+        is_gyro = text_of(_DEBUG(frame.payload)[0]) == "gyro"
         if is_gyro and "DEBUG_FLOAT_ARRAY" in self._encodings:
             self._array_us = self._now_us
 
