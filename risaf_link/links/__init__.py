@@ -10,7 +10,7 @@ from risaf_link.links.link import Link, LinkCounts, Receive
 from risaf_link.links.memory import MemoryLink
 from risaf_link.links.serial import SerialLink
 from risaf_link.links.tcp import TcpInLink, TcpOutLink
-from risaf_link.links.tlog import RecordingParameters, TlogLink
+from risaf_link.links.tlog import RecordingParameters, TlogLink, overlap
 from risaf_link.links.udp import UdpInLink, UdpOutLink
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "UdpInLink",
     "UdpOutLink",
     "open_link",
+    "overlap",
 ]
 
 _HOST_PORT = rf"({HOST}):([0-9]{{1,9}})"

@@ -6,6 +6,7 @@ import itertools
 import json
 import logging
 import os
+import re
 import select
 import subprocess
 import sys
@@ -42,6 +43,13 @@ class RecordingParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 DEFAULTS = RecordingParameters()
+
+
+def overlap(one: Path, other: Path) -> bool:
+    """Whether two recordings would have files of the same name."""
+    return one.parent.resolve() == other.parent.resolve() and any(
+        re.fullmatch(recorder.names_of(a.name), b.name) for a, b in ((one, other), (other, one))
+    )
 
 
 class Pipes:
