@@ -17,7 +17,14 @@ import msgspec
 from risaf_link.config import Config
 from risaf_link.errors import ConfigError
 from risaf_link.kept import replace_file
-from risaf_link.mavlink.signing import KEY_SIZE, KeySnapshot, LinkSigning, SigningKey, SigningState
+from risaf_link.mavlink.signing import (
+    KEY_SIZE,
+    KeySnapshot,
+    LinkSigning,
+    SigningKey,
+    SigningParameters,
+    SigningState,
+)
 from risaf_link.private import read_private
 
 PRIVATE = 0o600
@@ -162,6 +169,26 @@ def open_keys(config: Config) -> Keys:
         link_id = i % 256 if link.signing.link_id is None else link.signing.link_id
         links[link.name] = LinkSigning(files[path].key, link_id, link.signing)
     return Keys(files.values(), links)
+
+
+def open_key(path: Path, where: str) -> LinkSigning:
+    """Read a key for a link of a program that is only there for a while: it stores nothing.
+
+    Its clock is the system's, set forward by what comes rightly signed from one that is ahead.
+
+    Parameters
+    ----------
+    path : Path
+    where : str
+        Which option names it; every error begins so.
+
+    Raises
+    ------
+    ConfigError
+        As `open_keys` does.
+    """
+    secret = _read_secret(path, f"{where}: {path}: ", may_be_missing=False)
+    return LinkSigning(SigningKey(secret), 0, SigningParameters(str(path)))
 
 
 def _may_be_set_up(config: Config, path: Path) -> bool:

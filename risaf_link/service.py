@@ -233,7 +233,10 @@ class Service:
         self._began_ns = time.perf_counter_ns()
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
         self._keys.advance(received_us)
-        table = self._accepted(self._parser(*sender).receive_table(data), sender[0])
+        table = self._parser(*sender).receive_table(data)
+        signing = self._keys.links.get(sender[0])
+        if signing:
+            table = signing.taken(table)
         self._frames += len(table)
         self._frames_in[sender[0]] += len(table)
         self._record(table, received_us)
@@ -249,14 +252,6 @@ class Service:
         self._hand_out(self._component.collect(self._peers()))
         self._tell_mismatch()
         self._tell_recalled()
-
-    def _accepted(self, table: FrameTable, link: str) -> FrameTable:
-        """Those frames that the link's signing takes."""
-        signing = self._keys.links.get(link)
-        if signing is None:
-            return table
-        taken = [signing.accepts(table.frame(row)) for row in range(len(table))]
-        return FrameTable(table.buffer, table.cuts[np.array(taken, bool)])
 
     def _record(self, table: FrameTable, received_us: int) -> None:
         """Record what was taken, but for keys."""

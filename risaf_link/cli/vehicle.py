@@ -167,9 +167,15 @@ def simulate(
 
 @click.command()
 @click.argument("source", metavar="URL|LOG")
+@click.option(
+    "--key",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Signing key of the link: show only what is signed with it, and sign what is sent.",
+)
 @listening
 @interrupted
-def monitor(source: str, listen: tuple[str, int]) -> None:
+def monitor(source: str, key: Path | None, listen: tuple[str, int]) -> None:
     """Show vehicles on a page in the browser: live from a link, or from a log.
 
     A URL is one of those that `run` takes. The page finds the risaf_link components there, asks
@@ -178,7 +184,7 @@ def monitor(source: str, listen: tuple[str, int]) -> None:
 
     \b
     risaf-link monitor udpin://0.0.0.0:14550
-    risaf-link monitor udpout://192.168.1.10:14560
+    risaf-link monitor udpout://192.168.1.10:14560 --key signing.key
     risaf-link monitor drive.tlog
     """
     import asyncio
@@ -186,6 +192,8 @@ def monitor(source: str, listen: tuple[str, int]) -> None:
 
     with extra("monitor"):
         from risaf_link.monitor.server import serve
+    from risaf_link.errors import ConfigError
+    from risaf_link.keys import open_key
     from risaf_link.links import open_link
     from risaf_link.monitor.recording import Player, open_recording
     from risaf_link.monitor.source import Live, Log, Source
@@ -195,7 +203,10 @@ def monitor(source: str, listen: tuple[str, int]) -> None:
     path = Path(source.removeprefix("tlog://"))
     shown: Source
     if "://" in source and not source.startswith("tlog://"):
-        shown = Live(source, open_link(source, "URL", unix_us), unix_us)
+        signing = open_key(key, "--key") if key else None
+        shown = Live(source, open_link(source, "URL", unix_us), unix_us, signing)
+    elif key:
+        raise ConfigError("--key: found it with a log, expected it with a link")
     else:
         with progress_over(path) as progress:
             shown = Log(path.name, Player(open_recording(path, progress)))
