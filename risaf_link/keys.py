@@ -16,7 +16,6 @@ import msgspec
 
 from risaf_link.config import Config
 from risaf_link.errors import ConfigError
-from risaf_link.kept import replace_file
 from risaf_link.mavlink.signing import (
     KEY_SIZE,
     KeySnapshot,
@@ -26,6 +25,7 @@ from risaf_link.mavlink.signing import (
     SigningState,
 )
 from risaf_link.private import read_private
+from risaf_link.whole import replace_file
 
 PRIVATE = 0o600
 AGAIN_S = 5.0  # after what could not be stored; half of the clocks' reserve is 15 s

@@ -16,7 +16,7 @@ import numpy as np
 
 from risaf_link.config import Config
 from risaf_link.core.memory import Memory
-from risaf_link.kept import replace_file
+from risaf_link.whole import replace_file
 
 VERSION = 1
 LARGEST = 4_000_000  # bytes; 1000 sensors take 200 kB

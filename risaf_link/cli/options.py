@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import click
 
 from risaf_link.address import address_in
-from risaf_link.errors import ConfigError, RisafError
+from risaf_link.errors import RisafError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -146,14 +146,6 @@ def extra(name: str) -> Iterator[None]:
         raise RisafError(
             f"needs {error.name}: install risaf-link with the extra `{name}`"
         ) from None
-
-
-def opened(path: Path, mode: str) -> Any:
-    """Open a file that the user has named."""
-    try:
-        return path.open(mode)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from None
 
 
 @contextmanager

@@ -11,7 +11,6 @@ from risaf_link.cli.options import (
     extra,
     interrupted,
     listening,
-    opened,
     progress_over,
     rooted,
 )
@@ -148,8 +147,9 @@ def simulate(
         raise click.UsageError("expected --out LOG.tlog or --live URL")
     if out:
         from risaf_link.mavlink.tlog import record
+        from risaf_link.whole import written
 
-        with opened(out, "wb") as file:
+        with written(out, "wb") as file:
             for time_us, raw in frames(chosen):
                 file.write(record(record_time_us(time_us), raw))
     if url:
