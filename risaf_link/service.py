@@ -437,6 +437,8 @@ class Service:
             now_us = round(loop.time() * 1e6)
             gathered = self.pipeline.assembler.counts["epochs"]
             is_alive = self._component.note_gathered(gathered, now_us)
+            for recording in self._recordings:
+                self._component.complaints[f"recording {recording.name}"] = recording.trouble
             self._component.advance(now_us, self._clock_us())
             self._hand_out(self._component.collect(self._peers()))
             self._supervisor.tell(loop.time(), lambda: self._component.status, is_alive)

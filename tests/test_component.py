@@ -515,6 +515,14 @@ class TestNotices:
         said = texts(network.wait(1)[NEAR])
         assert said == ["no estimates: " + "x" * 120]
 
+    def test_a_complaint_is_told_once_and_when_it_has_gone(self, network):
+        complaints = network.component.complaints
+        complaints["recording log"] = "/var: No space left on device"
+        wrong = "recording log: /var: No space left on device"
+        assert texts(network.wait(60)[NEAR]) == [wrong]
+        complaints["recording log"] = ""
+        assert texts(network.wait(60)[NEAR]) == ["recording log: in order again"]
+
     @pytest.mark.parametrize("length", [36, 37, 86, 87])
     def test_the_last_chunk_is_never_full_of_more_than_one(self, network, length):
         network.component.trouble = "y" * (length - 1)

@@ -58,6 +58,17 @@ async def test_a_recording_replays_to_the_same_outputs_bit_for_bit(ground, tmp_p
     assert replayed(config, recording) == live
 
 
+async def test_the_operator_is_told_of_a_recording_for_which_there_is_no_room(ground, tmp_path):
+    limits = "recording: {least_free_bytes: 1000000000000000000}"
+    recording = f"{{name: log, url: 'tlog://{tmp_path}/drive.tlog', {limits}}}"
+    async with Running(config_for(ground, recording), up=2):
+        text = ""
+        while "recording" not in text:
+            chunk = (await ground.next("STATUSTEXT")).payload
+            text = text + chunk[1:51].rstrip(b"\0").decode()
+    assert text == f"recording log: {tmp_path}: less than 10"[: len(text)]
+
+
 async def test_what_a_ground_station_sets_is_in_the_recording_and_replays_bit_for_bit(
     ground, tmp_path
 ):

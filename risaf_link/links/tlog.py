@@ -157,6 +157,11 @@ class TlogLink(Link):
         self._told_lost = 0
         self._next_telling_s = 0.0
 
+    @property
+    def trouble(self) -> str:
+        """Why nothing is written just now; empty: it is, or will be soon."""
+        return self._failure or ""
+
     def record(self, received_us: int, *frames: bytes) -> None:
         """Record frames that were received."""
         self._put([record(received_us, raw, RECEIVED) for raw in frames])

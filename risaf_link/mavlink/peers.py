@@ -94,6 +94,13 @@ class Peers:
             for emitter in self._emitters.values():
                 emitter.profile = profile
 
+    @property
+    def misses_profile(self) -> bool:
+        """Whether somebody is to get ODOMETRY, and it is not known in which form."""
+        if self._profile is not None:
+            return False
+        return any("ODOMETRY" in emitter.rates for emitter in self._emitters.values())
+
     def ask(self, peer: Peer, message_id: int, interval_us: float) -> bool:
         """Let a peer have a message so often, -1 not at all, 0 by default; whether that can be."""
         name = EMITTED.get(message_id)
