@@ -47,6 +47,7 @@ ESTIMATE = an_estimate()
 
 def at(time_s: float, **changes) -> Estimate:
     estimate = copy(ESTIMATE)
+    changes = {"heading": ESTIMATE.heading} | changes  # it would be made of the other changes
     vars(estimate).update(time_us=round(time_s * 1e6), elapsed=time_s, **changes)
     return estimate
 
