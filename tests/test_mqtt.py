@@ -12,10 +12,11 @@ import sys
 import numpy as np
 import pytest
 import trustme
-from brokers import SAFETY_S, Amqtt, Listener, Mosquitto, Proxy, free_port, until
+from brokers import SAFETY_S, Amqtt, Listener, Mosquitto, Proxy, until
 from daemon import EPOCHS, Running, bursts, config_for, feed
 from estimates import estimates
 from msgspec import structs
+from ports import free_port
 
 from risaf_link.core.rotation import euler_from_quaternion
 from risaf_link.mavlink.notices import Notice, Severity
@@ -257,7 +258,7 @@ class TestTheServiceGoesOn:
             assert waiting["attitude"] + publisher.counts().dropped["attitude"] == EPOCHS
 
     async def test_without_a_broker(self, ground):
-        await self.every_epoch_is_answered(ground, free_port())
+        await self.every_epoch_is_answered(ground, free_port(socket.SOCK_STREAM))
 
     async def test_with_one_that_takes_connections_and_never_answers(self, ground):
         with socket.create_server(("127.0.0.1", 0)) as silent:

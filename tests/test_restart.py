@@ -4,7 +4,6 @@ import asyncio
 import json
 import math
 import signal
-import socket
 import sys
 import time
 
@@ -14,6 +13,7 @@ from daemon import SAFETY_S, Running, bursts, config_for, feed, outputs, replaye
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
+from ports import free_port
 from vehicle import Vehicle
 
 from risaf_link.config import Config, StateParameters
@@ -27,12 +27,6 @@ from risaf_link.sim.scenario import scenario
 from risaf_link.sim.stream import frames
 
 SENSORS, NOISE, BIAS = 12, 1e-3, 5e-3  # rad/s
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Drive:

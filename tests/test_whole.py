@@ -4,9 +4,8 @@ import resource
 from contextlib import contextmanager
 
 import pytest
-from click.testing import CliRunner
+from command import call
 
-from risaf_link.cli import main
 from risaf_link.errors import ConfigError, RisafError
 from risaf_link.mavlink.tlog import record
 from risaf_link.sim.scenario import scenario
@@ -33,10 +32,6 @@ def log(tmp_path_factory):
     drive = scenario("circle", 1, duration=20.0, sensors=5)
     path.write_bytes(b"".join(record(time_us, raw) for time_us, raw in frames(drive)))
     return path
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize("option", ["--csv", "--mcap", "--out"])
