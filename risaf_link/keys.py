@@ -20,6 +20,7 @@ from risaf_link.mavlink.signing import (
     KEY_SIZE,
     KeySnapshot,
     LinkSigning,
+    Rejection,
     SigningKey,
     SigningParameters,
     SigningState,
@@ -29,6 +30,7 @@ from risaf_link.whole import replace_file
 
 PRIVATE = 0o600
 AGAIN_S = 5.0  # after what could not be stored; half of the clocks' reserve is 15 s
+TELL_REJECTED_S = 60.0  # from one line on rejected frames to the next
 EXPECTED = f"{KEY_SIZE} bytes or {2 * KEY_SIZE} hexadecimal digits, not all zero"
 
 _log = logging.getLogger(__name__)
@@ -82,6 +84,8 @@ class Keys:
         self._files = tuple(files)
         self._next_s = 0.0  # when what is due is stored at the earliest
         self._failure = ""
+        self._told_rejected: Counter[str] = Counter()
+        self._next_telling_s = 0.0
 
     @property
     def rejected(self) -> Counter[str]:
@@ -136,6 +140,19 @@ class Keys:
         elif failure != self._failure:
             _log.error("a signing key's clock is not stored: %s", failure)
         self._failure = failure
+
+    def tell_rejected(self, now_s: float) -> None:
+        """Say in the log what was rejected, if there is more, but not all the time."""
+        rejected = self.rejected
+        if now_s < self._next_telling_s or rejected == self._told_rejected:
+            return
+        self._next_telling_s = now_s + TELL_REJECTED_S
+        new = sorted((rejected - self._told_rejected).items())
+        self._told_rejected = rejected
+        counts = ", ".join(f"{reason} {count}" for reason, count in new)
+        only_again = all(reason.endswith(Rejection.REPLAYED) for reason, _ in new)
+        level = logging.INFO if only_again else logging.WARNING  # networks repeat and overtake
+        _log.log(level, "rejected for their signatures: %s", counts)
 
     def close(self) -> None:
         """Store the clocks as they are."""

@@ -55,7 +55,7 @@ async def figures(port: int) -> dict[tuple[str, ...], float]:
 
 
 async def port_of(service: Service) -> int:
-    (metrics,) = service._outputs
+    (metrics,) = service._outputs.running
     await until(lambda: metrics.page.port)
     return metrics.page.port
 
@@ -146,7 +146,7 @@ async def test_who_asks_and_does_not_go_on_costs_no_epoch(ground):
         for k in range(scrape.MOST_AT_ONCE):
             idle = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
             idle.sendall(b"GET /metrics HTTP/1.1\r\n" + b"\r\n" * (k % 2))  # half never end
-        (metrics,) = service._outputs
+        (metrics,) = service._outputs.running
         await until(lambda: len(metrics.page._answering) >= scrape.MOST_AT_ONCE // 2)
         assert len(await feed(ground, service, bursts())) == EPOCHS
 
@@ -202,11 +202,11 @@ async def test_a_port_that_is_taken_is_told_once_and_the_service_goes_on(
 
 async def test_an_output_that_fails_ends_alone(ground, caplog):
     async with Running(metered(ground), up=2) as service:
-        (metrics,) = service._outputs
-        before = service._outputs
+        (metrics,) = service._outputs.running
+        before = service._outputs.running
         metrics.take = None  # whatever goes wrong in it
         assert len(await feed(ground, service, bursts())) == EPOCHS
-        assert (len(before), service._outputs) == (1, [])
+        assert (len(before), service._outputs.running) == (1, [])
     assert caplog.messages.count("Metrics has failed and is left out") == 1
 
 

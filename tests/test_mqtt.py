@@ -252,7 +252,7 @@ class TestTheServiceGoesOn:
         config = structs.replace(config_for(ground), mqtt=chosen)
         async with Running(config, up=2) as service:
             assert len(await feed(ground, service, bursts())) == EPOCHS
-            (publisher,) = service._outputs
+            (publisher,) = service._outputs.running
             waiting = publisher.counts().waiting
             assert waiting["attitude"] <= config.mqtt.states_kept
             assert waiting["attitude"] + publisher.counts().dropped["attitude"] == EPOCHS

@@ -24,9 +24,9 @@ from daemon import (
 )
 from pymavlink.dialects.v20 import all as public
 
+from risaf_link.loop import unix_us
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.tlog import TlogReader, record
-from risaf_link.service import unix_us
 
 
 async def test_every_epoch_gives_an_attitude_that_pymavlink_reads(ground):

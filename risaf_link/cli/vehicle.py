@@ -34,7 +34,8 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
 
     from risaf_link.config import load
     from risaf_link.kept import kept_parameters
-    from risaf_link.service import Service, loop_factory, settled, until_told
+    from risaf_link.loop import loop_factory, settled, until_told
+    from risaf_link.service import Service
     from risaf_link.supervisor import of_this_process
 
     level = logging.INFO if verbose else logging.WARNING
@@ -157,7 +158,7 @@ def simulate(
 
         from risaf_link.links import open_link
         from risaf_link.links.play import play
-        from risaf_link.service import unix_us, until_told
+        from risaf_link.loop import unix_us, until_told
 
         link = open_link(url, "--live", unix_us)
         asyncio.run(until_told(play(frames(chosen), link)))
@@ -195,9 +196,9 @@ def monitor(source: str, key: Path | None, listen: tuple[str, int]) -> None:
     from risaf_link.errors import ConfigError
     from risaf_link.keys import open_key
     from risaf_link.links import open_link
+    from risaf_link.loop import unix_us, until_told
     from risaf_link.monitor.recording import Player, open_recording
     from risaf_link.monitor.source import Live, Log, Source
-    from risaf_link.service import unix_us, until_told
 
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     path = Path(source.removeprefix("tlog://"))
@@ -234,7 +235,7 @@ def demo(seed: int, listen: tuple[str, int]) -> None:
 
     with extra("monitor"):
         from risaf_link.demo import demo as show
-    from risaf_link.service import unix_us, until_told
+    from risaf_link.loop import unix_us, until_told
 
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     tell = partial(click.echo, err=True)
