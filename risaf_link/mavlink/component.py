@@ -35,9 +35,6 @@ CAPABILITIES = 8 | 16 | 8192
 """MAV_PROTOCOL_CAPABILITY: COMMAND_INT, PARAM_ENCODE_BYTEWISE (REAL32 is the same in both ways, and
 one must be told), MAVLINK2."""
 
-UNFED_US = 10_000_000  # that ODOMETRY may wait for the autopilot's HEARTBEAT
-UNFED = "not sent: neither PX4 nor ArduPilot is heard, and mavlink.odometry is auto"
-
 TIMESYNC = IDS["TIMESYNC"]
 ORDERS = frozenset(
     IDS[name]
@@ -140,7 +137,6 @@ class Component:
         self._pulse = Pulse()
         self._storing: Order | None = None
         self._advanced_us: int | None = None
-        self._unfed_us: int | None = None  # since when somebody waits for ODOMETRY in vain
         self._commands: dict[int, Callable[[Order], Result]] = {
             Command.PREFLIGHT_CALIBRATION: self._calibrate,
             Command.PREFLIGHT_STORAGE: self._store,
@@ -219,7 +215,7 @@ class Component:
             self._outbox.append((None, "HEARTBEAT", heartbeat(self._pulse.state)))
         if self._pulse.has_stalled:
             self._report(self._calibration.end("failed: no samples"))
-        self._look_after_odometry(now_us)
+        self.complaints["ODOMETRY"] = self._peers.complaint(now_us)
         stalled = self._pulse.has_stalled
         for notice in self._notices.due(now_us, stalled, self.trouble, self.complaints):
             self._tell(notice)
@@ -315,15 +311,6 @@ class Component:
         self._estimator.configure(self._tuned)
         if self._tuned.emit != before.emit:
             self._peers.set_defaults(self._tuned.emit)
-
-    def _look_after_odometry(self, now_us: int) -> None:
-        """Complain where nobody tells in which form it is wanted."""
-        if not self._peers.misses_profile:
-            self._unfed_us = None
-        elif self._unfed_us is None:
-            self._unfed_us = now_us
-        unfed = self._unfed_us is not None and now_us - self._unfed_us >= UNFED_US
-        self.complaints["ODOMETRY"] = UNFED if unfed else ""
 
     def _set_up_signing(self, frame: Frame, peer: Peer) -> None:
         """Take another key, if it is for us alone and the link is one that may set it."""
