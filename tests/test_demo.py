@@ -6,6 +6,7 @@ import os
 import re
 import select
 import signal
+import socket
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -57,6 +58,9 @@ def test_the_demo_shows_a_vehicle_and_ends_with_all_its_processes():
                     break
         assert update["known"]["array"]["sensors"] == 120
         assert update["chosen"] == [1, 191]
+        broker = re.search(r"mosquitto_sub -p (\d+)", told)
+        if broker:
+            socket.create_connection(("127.0.0.1", int(broker[1])), timeout=SAFETY_S).close()
     assert process.returncode == 0
     assert not any(map(is_there, started))
 
