@@ -1,13 +1,19 @@
-"""What MQTT and metrics cost the estimator: latencies with and without them, by turns in one run.
+"""What MQTT, metrics and the page cost the estimator: latencies with and without, by turns.
 
-python benchmarks/outputs.py [--rounds N] [--seconds S] [--sensors N] [--rate HZ]
+python benchmarks/outputs.py [--rounds N] [--seconds S] [--sensors N] [--rate HZ] [--shared]
 
-A round is a run of the service without outputs and one with both: a mosquitto on 127.0.0.1 that
-this starts, and a scrape a second. Which comes first changes from round to round. Times are wire to
-wire, as `risaf-link bench --only live` has them.
+A round is a run of the service without outputs, one with MQTT and metrics (a mosquitto on 127.0.0.1
+that this starts, and a scrape a second), and one with these and the page, which somebody looks at.
+Which comes first changes from round to round. Times are wire to wire, as `risaf-link bench --only
+live` has them.
+
+The page belongs to another machine: here its processes take a core only when the service and who
+measures do not want it, unless `--shared` lets them compete. On a machine with other work, `chrt -f
+5 python ...` as root keeps that away: everything but the page has a real-time priority then.
 """
 
 import argparse
+import os
 import shutil
 import socket
 import subprocess
@@ -16,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import product
 from pathlib import Path
 from statistics import median, quantiles
 
@@ -32,6 +39,17 @@ while True:
         pass
     time.sleep(1.0)
 """
+VIEWER = """
+import sys, time, urllib.request
+while True:
+    try:
+        for line in urllib.request.urlopen(sys.argv[1], timeout=5):
+            pass
+    except OSError:
+        pass
+    time.sleep(0.1)
+"""
+NAMES = {"none": "without", "some": "with MQTT and metrics", "all": "with the page as well"}
 
 
 def main() -> None:
@@ -41,41 +59,44 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--sensors", type=int, default=150)
     parser.add_argument("--rate", type=float, default=100.0)
+    parser.add_argument("--shared", action="store_true", help="the page competes for the cores")
     told = parser.parse_args()
     # A short scenario starts again, and is then quick to make.
     length = min(told.seconds, 30.0 if told.rate <= 100.0 else 1.0)
     chosen = scenario("circle", SEED, sensors=told.sensors, rate=told.rate, duration=length)
-    courses: dict[str, list[Course]] = {"without": [], "with": []}
+    courses: dict[str, list[Course]] = {which: [] for which in NAMES}
     print("round        p50 us  p99 us  core %  MB    lost")
     with tempfile.TemporaryDirectory() as directory, mosquitto(Path(directory)) as broker:
         for k in range(told.rounds):
-            for which in sorted(courses, reverse=bool(k % 2)):
-                course = run(chosen, told.seconds, broker if which == "with" else None)
+            for which in [*NAMES, *reversed(NAMES)][3 * (k % 2) :][:3]:
+                course = run(chosen, told.seconds, broker, which, told.shared)
                 courses[which].append(course)
-                print(f"{k} {which:8} {figures(course)}", flush=True)
-    for percent in (50, 99):
+                print(f"{k} {which:5} {figures(course)}", flush=True)
+    for which, percent in product(list(NAMES)[1:], (50, 99)):
         pairs = [
             (percentile(a.latencies_us, percent), percentile(b.latencies_us, percent))
-            for a, b in zip(courses["without"], courses["with"], strict=True)
+            for a, b in zip(courses["none"], courses[which], strict=True)
         ]
         ratios = sorted(after / before for before, after in pairs)
-        pooled = [
-            percentile([us for course in courses[which] for us in course.latencies_us], percent)
-            for which in ("without", "with")
-        ]
+        before, after = (
+            percentile([us for course in courses[name] for us in course.latencies_us], percent)
+            for name in ("none", which)
+        )
         print(
-            f"p{percent}: {pooled[0]:.0f} us without, {pooled[1]:.0f} us with, of all; "
-            f"ratio by round {median(ratios):.3f} ({ratios[0]:.3f} to {ratios[-1]:.3f})"
+            f"p{percent}: {before:.0f} us {NAMES['none']}, {after:.0f} us {NAMES[which]}, of all "
+            f"{after / before:.3f}; by round {median(ratios):.3f} ({ratios[0]:.3f} to "
+            f"{ratios[-1]:.3f})"
         )
 
 
-def run(chosen: Scenario, seconds: float, broker: int | None) -> Course:
-    """Drive one service, with both outputs where there is a broker."""
+def run(chosen: Scenario, seconds: float, broker: int, which: str, shared: bool) -> Course:
+    """Drive one service, with some outputs or all of them."""
     settings: list[str] = []
+    links: list[str] = []
     meter = Meter()
     with ExitStack() as stack:
         stack.callback(meter.close)
-        if broker is not None:
+        if which != "none":
             port = free_port()
             settings = [
                 f"mqtt={{url: 'mqtt://127.0.0.1:{broker}', vehicle: bench}}",
@@ -83,8 +104,28 @@ def run(chosen: Scenario, seconds: float, broker: int | None) -> Course:
             ]
             url = f"http://127.0.0.1:{port}/metrics"
             stack.enter_context(process([sys.executable, "-c", SCRAPER, url]))
-        number = stack.enter_context(service(meter, COMMAND, chosen.rate, settings))
+        if which == "all":
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind(("127.0.0.1", 0))
+                at = f"127.0.0.1:{probe.getsockname()[1]}"
+            links = [f"{{name: page, url: 'udpin://{at}'}}"]
+            page = f"127.0.0.1:{free_port()}"
+            for command in (
+                [*COMMAND, "monitor", f"udpout://{at}", "--listen", page],
+                [sys.executable, "-c", VIEWER, f"http://{page}/updates"],
+            ):
+                started = stack.enter_context(process(command))
+                if not shared:
+                    give_way(started)
+        number = stack.enter_context(service(meter, COMMAND, chosen.rate, settings, links))
         return drive(meter, number, chosen, seconds)
+
+
+def give_way(number: int) -> None:
+    """Let a process have a core only when we, and who has our priority, do not want it."""
+    is_usual = os.sched_getscheduler(0) == os.SCHED_OTHER
+    policy = os.SCHED_IDLE if is_usual else os.SCHED_OTHER
+    os.sched_setscheduler(number, policy, os.sched_param(0))
 
 
 def figures(course: Course) -> str:
@@ -130,11 +171,11 @@ def mosquitto(directory: Path) -> Iterator[int]:
 
 
 @contextmanager
-def process(command: list[str]) -> Iterator[None]:
-    """Run a program as long as it is needed."""
-    with subprocess.Popen(command) as running:  # noqa: S603
+def process(command: list[str]) -> Iterator[int]:
+    """Run a program as long as it is needed; its process id."""
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as running:  # noqa: S603
         try:
-            yield
+            yield running.pid
         finally:
             running.terminate()
 

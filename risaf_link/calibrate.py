@@ -17,11 +17,11 @@ from risaf_link.core.fusion import Epoch
 from risaf_link.core.mounting import Readings
 from risaf_link.core.rotation import Floats, matrix_from_quaternion
 from risaf_link.errors import ConfigError, LogError
-from risaf_link.kept import replace_file
 from risaf_link.links.file import read
 from risaf_link.mavlink.epoch import EpochAssembler, GyroChunk
 from risaf_link.mavlink.ingest import Ingest
 from risaf_link.mavlink.tlog import TlogReader
+from risaf_link.whole import replace_file
 
 MOST_EPOCHS, MOST_READINGS = 50_000, 9_000_000  # that are kept; of more, every second is dropped
 DIGITS = 9  # behind the point: beyond what any log tells

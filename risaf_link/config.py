@@ -17,7 +17,7 @@ from msgspec import Meta, Struct, field, inspect
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.tunable import Tunable
 from risaf_link.errors import ConfigError, LinkError
-from risaf_link.links import RecordingParameters, open_link
+from risaf_link.links import RecordingParameters, TlogLink, open_link, overlap
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.identity import Identity
 from risaf_link.mavlink.odometry import ProfileName
@@ -165,17 +165,24 @@ def _tree(config: Config) -> dict[str, Any]:
 
 def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
     names = [link.name for link in links]
+    recordings: list[Path] = []
     for i, link in enumerate(links):
         if link.name in names[:i]:
             raise ConfigError(f"{where}links.{i}.name: found {link.name!r} twice, expected once")
         try:
-            open_link(link.url, link.name, lambda: 0)
+            made = open_link(link.url, link.name, lambda: 0)
         except LinkError as error:
             raise ConfigError(f"{where}links.{i}.url: {error}") from None
         if link.signing:
             _check_signing(f"{where}links.{i}.signing", link)
-        if link.url.startswith("tlog:") and link.url in [other.url for other in links[:i]]:
-            raise ConfigError(f"{where}links.{i}.url: found {link.url!r} twice, expected once")
+        if isinstance(made, TlogLink):
+            same = next((path for path in recordings if overlap(path, made.path)), None)
+            if same:
+                raise ConfigError(
+                    f"{where}links.{i}.url: found {link.url!r} beside the recording {same}, "
+                    "expected names that no segment of another has"
+                )
+            recordings.append(made.path)
         if link.recording and not link.url.startswith("tlog:"):
             raise ConfigError(
                 f"{where}links.{i}.recording: found it of a link with peers, expected it of a "

@@ -12,18 +12,22 @@ import sys
 from asyncio.subprocess import Process
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from functools import partial
 from typing import Any
 
 from risaf_link.errors import RisafError
 from risaf_link.links import open_link
 from risaf_link.monitor.server import serve
 from risaf_link.monitor.source import Live
+from risaf_link.parent import end_with
 
 HOST = "127.0.0.1"
 NAME = "demo"  # of the vehicle, at the broker
 GROUND_PORT = 14550  # where ground stations listen
+BROKER = "listener {port} {host}\nallow_anonymous true\nuser root\n"
+"""How mosquitto is configured; one that root starts and that takes another user outlives us."""
+
 END_S = 5.0  # in which a process that was asked to end must do so
-GRACE_S = 0.5  # in which we hear of Ctrl-C ourselves, after a process that it ended
 
 
 async def demo(
@@ -57,7 +61,7 @@ async def demo(
     mqtt = ("--set", f"mqtt.url=mqtt://{HOST}:{broker_port}", "--set", f"mqtt.vehicle={NAME}")
     ours = sys.executable, "-m", "risaf_link.cli"
     commands: dict[str, tuple[str, ...]] = {
-        **({"broker": (broker, "-p", str(broker_port))} if broker else {}),
+        **({"broker": (broker, "-c", "/dev/stdin")} if broker else {}),
         "service": (
             *ours,
             "run",
@@ -72,13 +76,14 @@ async def demo(
     }
     url = f"udpout://{HOST}:{page_port}"
     async with AsyncExitStack() as started:
+        told = {"broker": BROKER.format(port=broker_port, host=HOST)}
         processes = {
-            name: await started.enter_async_context(_running(*command, quiet=name == "broker"))
+            name: await started.enter_async_context(_running(*command, told=told.get(name)))
             for name, command in commands.items()
         }
         tell("service  risaf-link run")
         tell("vehicle  simulated: 120 gyros, shocked at times; some fall silent and come back;")
-        tell("         40 s of every 2 minutes without GPS")
+        tell("         40 s of every 2 minutes without GPS, 15 s of every 4 with a wrong course")
         tell(f"MAVLink  any ground station on UDP port {GROUND_PORT} sees it as well")
         if broker:
             tell(f"MQTT     mosquitto_sub -p {broker_port} -v -t 'risaf/{NAME}/#'")
@@ -101,7 +106,6 @@ async def _until_one_ends(
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         if page.done():
             page.result()
-        await asyncio.sleep(GRACE_S)
         name, status = next((name, end.result()) for name, end in ends.items() if end.done())
     finally:
         for task in tasks:
@@ -113,13 +117,24 @@ async def _until_one_ends(
 
 
 @asynccontextmanager
-async def _running(*command: str, quiet: bool = False) -> AsyncIterator[Process]:
-    """Run a command as a process, which ends with the block."""
+async def _running(*command: str, told: str | None) -> AsyncIterator[Process]:
+    """Run a command as a process, which ends with the block, and with us.
+
+    Ctrl-C is for us alone: in a group of its own it does not hear of it. One that is told
+    something says nothing.
+    """
     nowhere = asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(
-        *command, stdin=nowhere, stderr=nowhere if quiet else None
+        *command,
+        stdin=nowhere if told is None else asyncio.subprocess.PIPE,
+        stderr=None if told is None else nowhere,
+        process_group=0,
+        preexec_fn=partial(end_with, os.getpid()),
     )
     try:
+        if process.stdin:
+            process.stdin.write((told or "").encode())
+            process.stdin.close()
         yield process
     finally:
         with suppress(ProcessLookupError):

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from risaf_link.errors import ConfigError
-from risaf_link.kept import replace_file
+from risaf_link.whole import replace_file
 
 UNIT = Path("etc/systemd/system/risaf-link.service")
 WANTED = Path("etc/systemd/system/multi-user.target.wants/risaf-link.service")

@@ -4,9 +4,7 @@ They go over the configuration's file, which is never written, and under what `-
 """
 
 import logging
-import os
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from msgspec import structs
 
 from risaf_link.config import Config, StateParameters, load
 from risaf_link.mavlink.parameters import Parameters, parameters_of
+from risaf_link.whole import replace_file
 
 HEAD = "# Parameters that were set over MAVLink; they go over the configuration.\n"
 
@@ -110,31 +109,6 @@ def chosen_by(settings: Iterable[str]) -> tuple[str, ...]:
     )
 
 
-def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
-    """Replace a file, all or nothing, also if power fails; raises OSError.
-
-    Parameters
-    ----------
-    path : Path
-    content : bytes
-    mode : int
-        Who may read and write it, less what the process's umask takes off.
-    """
-    new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)  # who may read it would be as before
-    try:
-        with open(new, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(path)
-    except OSError:
-        with suppress(OSError):
-            new.unlink(missing_ok=True)  # half a file
-        raise
-    _sync(path.parent)
-
-
 def _place(config: Config, config_path: Path | None) -> Path | None:
     if config.mavlink.parameters:
         return Path(config.mavlink.parameters)
@@ -153,12 +127,3 @@ def _read(path: Path) -> dict[Any, Any]:
         _log.warning("%s: found %.40r, expected names with values; left out", path, found)
         return {}
     return found or {}
-
-
-def _sync(directory: Path) -> None:
-    """Make sure that a file's new name lasts."""
-    handle = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -16,12 +16,21 @@ import msgspec
 
 from risaf_link.config import Config
 from risaf_link.errors import ConfigError
-from risaf_link.kept import replace_file
-from risaf_link.mavlink.signing import KEY_SIZE, KeySnapshot, LinkSigning, SigningKey, SigningState
+from risaf_link.mavlink.signing import (
+    KEY_SIZE,
+    KeySnapshot,
+    LinkSigning,
+    Rejection,
+    SigningKey,
+    SigningParameters,
+    SigningState,
+)
 from risaf_link.private import read_private
+from risaf_link.whole import replace_file
 
 PRIVATE = 0o600
 AGAIN_S = 5.0  # after what could not be stored; half of the clocks' reserve is 15 s
+TELL_REJECTED_S = 60.0  # from one line on rejected frames to the next
 EXPECTED = f"{KEY_SIZE} bytes or {2 * KEY_SIZE} hexadecimal digits, not all zero"
 
 _log = logging.getLogger(__name__)
@@ -75,6 +84,8 @@ class Keys:
         self._files = tuple(files)
         self._next_s = 0.0  # when what is due is stored at the earliest
         self._failure = ""
+        self._told_rejected: Counter[str] = Counter()
+        self._next_telling_s = 0.0
 
     @property
     def rejected(self) -> Counter[str]:
@@ -130,6 +141,19 @@ class Keys:
             _log.error("a signing key's clock is not stored: %s", failure)
         self._failure = failure
 
+    def tell_rejected(self, now_s: float) -> None:
+        """Say in the log what was rejected, if there is more, but not all the time."""
+        rejected = self.rejected
+        if now_s < self._next_telling_s or rejected == self._told_rejected:
+            return
+        self._next_telling_s = now_s + TELL_REJECTED_S
+        new = sorted((rejected - self._told_rejected).items())
+        self._told_rejected = rejected
+        counts = ", ".join(f"{reason} {count}" for reason, count in new)
+        only_again = all(reason.endswith(Rejection.REPLAYED) for reason, _ in new)
+        level = logging.INFO if only_again else logging.WARNING  # networks repeat and overtake
+        _log.log(level, "rejected for their signatures: %s", counts)
+
     def close(self) -> None:
         """Store the clocks as they are."""
         for file in self._files:
@@ -162,6 +186,26 @@ def open_keys(config: Config) -> Keys:
         link_id = i % 256 if link.signing.link_id is None else link.signing.link_id
         links[link.name] = LinkSigning(files[path].key, link_id, link.signing)
     return Keys(files.values(), links)
+
+
+def open_key(path: Path, where: str) -> LinkSigning:
+    """Read a key for a link of a program that is only there for a while: it stores nothing.
+
+    Its clock is the system's, set forward by what comes rightly signed from one that is ahead.
+
+    Parameters
+    ----------
+    path : Path
+    where : str
+        Which option names it; every error begins so.
+
+    Raises
+    ------
+    ConfigError
+        As `open_keys` does.
+    """
+    secret = _read_secret(path, f"{where}: {path}: ", may_be_missing=False)
+    return LinkSigning(SigningKey(secret), 0, SigningParameters(str(path)))
 
 
 def _may_be_set_up(config: Config, path: Path) -> bool:

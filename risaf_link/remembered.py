@@ -6,8 +6,10 @@ The file is replaced as a whole. What is in it is believed no further than `core
 file that is damaged, or another program's, is no reason not to start.
 """
 
+import asyncio
 import errno
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import numpy as np
 
 from risaf_link.config import Config
 from risaf_link.core.memory import Memory
-from risaf_link.kept import replace_file
+from risaf_link.whole import replace_file
 
 VERSION = 1
 LARGEST = 4_000_000  # bytes; 1000 sensors take 200 kB
@@ -81,6 +83,54 @@ class MemoryFile:
             return False
         self._failure = ""
         return True
+
+
+class MemoryKeeper:
+    """Keeps what is known in a file, again and again as it changes.
+
+    Parameters
+    ----------
+    file : MemoryFile
+    period : float
+        Seconds from one time to the next.
+    memory : callable
+        Tells what is known now; None: nothing.
+    """
+
+    def __init__(
+        self, file: MemoryFile, period: float, memory: Callable[[], Memory | None]
+    ) -> None:
+        self._file = file
+        self._period = period
+        self._memory = memory
+        self._next_s = 0.0
+        self._kept_us = 0  # when what was last kept was received
+        self._is_storing = False
+
+    def due(self, now_s: float) -> Memory | None:
+        """What is to be stored, at a time in seconds that does not jump; None: nothing."""
+        if not self._file.is_named or now_s < self._next_s or self._is_storing:
+            return None
+        self._next_s = now_s + self._period
+        memory = self._memory()
+        if memory is None or memory.received_us == self._kept_us:
+            return None
+        self._kept_us = memory.received_us
+        self._is_storing = True
+        return memory
+
+    async def store(self, memory: Memory) -> None:
+        """Store what was due, in a thread: a memory card can take longer than an epoch."""
+        try:
+            await asyncio.to_thread(self._file.write, memory)
+        finally:
+            self._is_storing = False
+
+    def end(self) -> None:
+        """Store what is known at the end."""
+        memory = self._memory() if self._file.is_named else None
+        if memory is not None and not self._is_storing:
+            self._file.write(memory)
 
 
 def memory_file(config: Config) -> MemoryFile:

@@ -17,6 +17,7 @@ from risaf_link.publish import plot
 from risaf_link.publish.album import Album
 from risaf_link.publish.course import Course
 from risaf_link.replay import Replay
+from risaf_link.whole import replace_file
 from risaf_link.words import REFERENCES
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ class LookBack:
             path = self._directory / PAGE
             try:
                 self._directory.mkdir(parents=True, exist_ok=True)
-                path.write_text(made, encoding="utf-8")
+                replace_file(path, made.encode())
             except OSError as error:
                 raise ConfigError(f"--report {path}: {error.strerror or error}") from None
 

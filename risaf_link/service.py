@@ -1,13 +1,10 @@
 """The daemon: links on one side, the pipeline on the other, and nothing between that waits."""
 
 import asyncio
-import gc
 import logging
-import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -17,10 +14,10 @@ from risaf_link.config import Config, identity_of, load_calibration
 from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.kernel import BUILT
-from risaf_link.errors import ConfigError
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.keys import open_keys
 from risaf_link.links import Link, TlogLink, open_link
+from risaf_link.loop import unix_us
 from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.component import HEARD, Component
@@ -30,11 +27,11 @@ from risaf_link.mavlink.notices import Notice, Severity
 from risaf_link.mavlink.parameters import Parameters
 from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.requests import Requests
-from risaf_link.mavlink.signing import SETUP_SIGNING, Rejection
+from risaf_link.mavlink.signing import SETUP_SIGNING
 from risaf_link.pipeline import Pipeline
 from risaf_link.publish.account import Account, Traffic
-from risaf_link.publish.output import Output
-from risaf_link.remembered import memory_file
+from risaf_link.publish.outputs import open_outputs
+from risaf_link.remembered import MemoryKeeper, memory_file
 from risaf_link.supervisor import Supervisor
 
 TICK_S = 0.1  # from one look at what is due by time to the next
@@ -42,48 +39,8 @@ OPENING = 20  # looks at whether the links are open, in the first TICK_S
 MOST_PEERS = 256  # of all links together
 PARAM_VALUE_BYTES = 37  # of a PARAM_VALUE frame
 PARAMETERS_SHARE = 0.4  # of a link, that a list of parameters takes at most
-TELL_REJECTED_S = 60.0  # from one line on rejected frames to the next
 
 _log = logging.getLogger(__name__)
-
-
-def unix_us() -> int:
-    """Microseconds since 1970."""
-    return time.time_ns() // 1000
-
-
-async def until_told(work: Coroutine[Any, Any, None]) -> None:
-    """Run until done, or until SIGINT or SIGTERM ask for the end."""
-    task = asyncio.ensure_future(work)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, task.cancel)
-    with suppress(asyncio.CancelledError):
-        await task
-
-
-def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    """Choose the event loop: uvloop's where it is installed, which costs less a datagram."""
-    try:
-        from uvloop import new_event_loop
-    except ImportError:
-        return None
-    made: Callable[[], asyncio.AbstractEventLoop] = new_event_loop
-    return made
-
-
-@contextmanager
-def settled() -> Iterator[None]:
-    """Let the garbage collector pass over all that is there by now.
-
-    To look through it takes 10 ms, in which an epoch would wait; what comes and goes with each
-    epoch is looked through in microseconds.
-    """
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
 
 
 class Service:
@@ -117,12 +74,13 @@ class Service:
     ) -> None:
         self._supervisor = supervisor or Supervisor({}, 0)
         parameters = Parameters(config, kept.values, kept.overruled)
-        self._memory_file = memory_file(config)
-        memory = self._memory_file.read()
+        file = memory_file(config)
+        memory = file.read()
         if memory:
-            self._memory_file.keep_used()
+            file.keep_used()
         calibration = load_calibration(config)
         self.pipeline = Pipeline(parameters.tuned, config.own, calibration, memory)
+        self._keeper = MemoryKeeper(file, config.state.period, self.pipeline.memory)
         self.links = [
             open_link(link.url, link.name, clock_us, link.recording) for link in config.links
         ]
@@ -130,8 +88,6 @@ class Service:
         self._kept = kept
         self._storing: set[asyncio.Task[None]] = set()
         self._keys = open_keys(config)
-        self._told_rejected: Counter[str] = Counter()
-        self._next_telling_s = 0.0
         self._component = Component(
             parameters,
             self.pipeline,
@@ -163,12 +119,8 @@ class Service:
         self._frames_in: Counter[str] = Counter()  # by link
         self._frames_out: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()  # from peers that are forgotten
-        self._outputs = self._open_outputs(config)
+        self._outputs = open_outputs(config.mqtt, config.metrics, self.account)
         self._mismatch = self._recalled = ""
-        self._state_period = config.state.period
-        self._next_state_s = 0.0
-        self._remembered_us = 0
-        self._remembering = False
 
     @property
     def dropped(self) -> Counter[str]:
@@ -199,15 +151,14 @@ class Service:
                 # A recorder is there before anything can be received.
                 for link in sorted(self.links, key=lambda link: link not in self._recordings):
                     tasks.create_task(link.run(partial(self._receive, link)))
-                for output in self._outputs:
-                    tasks.create_task(self._run_output(output))
+                tasks.create_task(self._outputs.run())
                 try:
                     await self._beat()
                 finally:  # the links are still open
                     self._supervisor.end()
                     self._take_held()
                     self._send(self.pipeline.flush(self._received_us))
-                    self._remember_now()
+                    self._keeper.end()
         finally:
             self._supervisor.end()
             self._keys.close()
@@ -233,7 +184,10 @@ class Service:
         self._began_ns = time.perf_counter_ns()
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
         self._keys.advance(received_us)
-        table = self._accepted(self._parser(*sender).receive_table(data), sender[0])
+        table = self._parser(*sender).receive_table(data)
+        signing = self._keys.links.get(sender[0])
+        if signing:
+            table = signing.taken(table)
         self._frames += len(table)
         self._frames_in[sender[0]] += len(table)
         self._record(table, received_us)
@@ -250,14 +204,6 @@ class Service:
         self._tell_mismatch()
         self._tell_recalled()
 
-    def _accepted(self, table: FrameTable, link: str) -> FrameTable:
-        """Those frames that the link's signing takes."""
-        signing = self._keys.links.get(link)
-        if signing is None:
-            return table
-        taken = [signing.accepts(table.frame(row)) for row in range(len(table))]
-        return FrameTable(table.buffer, table.cuts[np.array(taken, bool)])
-
     def _record(self, table: FrameTable, received_us: int) -> None:
         """Record what was taken, but for keys."""
         if not self._recordings:
@@ -272,11 +218,7 @@ class Service:
             for estimate, received_us in zip(block, block.received_us.tolist(), strict=True):
                 self._component.observe(estimate)
                 self._hand_out(self._component.emit(estimate, peers))
-                for output in self._outputs:
-                    try:
-                        output.take(estimate, received_us, self._began_ns)
-                    except Exception:
-                        self._leave_out(output)
+                self._outputs.take(estimate, received_us, self._began_ns)
 
     def _peers(self) -> Iterator[Peer]:
         return ((link.name, peer) for link in self.links for peer in link.peers)
@@ -303,43 +245,16 @@ class Service:
 
     def _look_after_state(self, now_s: float) -> None:
         """Store what is known, when it is due and has changed, without waiting for it."""
-        if not self._memory_file.is_named or now_s < self._next_state_s or self._remembering:
-            return
-        self._next_state_s = now_s + self._state_period
-        memory = self.pipeline.memory()
-        if memory is None or memory.received_us == self._remembered_us:
-            return
-        self._remembered_us = memory.received_us
-        self._remembering = True
-
-        async def store() -> None:
-            try:
-                await asyncio.to_thread(self._memory_file.write, memory)
-            finally:
-                self._remembering = False
-
-        self._begin(store())
-
-    def _remember_now(self) -> None:
-        """Store what is known at the end."""
-        memory = self.pipeline.memory() if self._memory_file.is_named else None
-        if memory is not None and not self._remembering:
-            self._memory_file.write(memory)
+        memory = self._keeper.due(now_s)
+        if memory:
+            self._begin(self._keeper.store(memory))
 
     def _look_after_keys(self, now_s: float) -> None:
         """Set their clocks, store what is due, and tell of rejected frames."""
         self._keys.advance(self._clock_us())
         if self._keys.is_due(now_s):
             self._begin(self._keys.store())
-        rejected = self.rejected
-        if now_s >= self._next_telling_s and rejected != self._told_rejected:
-            self._next_telling_s = now_s + TELL_REJECTED_S
-            new = sorted((rejected - self._told_rejected).items())
-            self._told_rejected = rejected
-            counts = ", ".join(f"{reason} {count}" for reason, count in new)
-            only_again = all(reason.endswith(Rejection.REPLAYED) for reason, _ in new)
-            level = logging.INFO if only_again else logging.WARNING  # networks repeat and overtake
-            _log.log(level, "rejected for their signatures: %s", counts)
+        self._keys.tell_rejected(now_s)
 
     def _parser(self, link: str, peer: str) -> FrameParser:
         parser = self._parsers.pop((link, peer), None) or FrameParser()
@@ -347,8 +262,6 @@ class Service:
         if len(self._parsers) > MOST_PEERS:
             self._dropped += self._parsers.pop(next(iter(self._parsers))).dropped
         return parser
-
-    # Outputs that are not MAVLink
 
     def account(self) -> Account:
         """What has come and gone, as of now."""
@@ -368,46 +281,10 @@ class Service:
             ],
         )
 
-    def _open_outputs(self, config: Config) -> list[Output]:
-        """Make those that are configured; they bring libraries, which take their time."""
-        outputs: list[Output] = []
-        mqtt = None
-        if config.mqtt.url:
-            from risaf_link.publish.mqtt import MqttPublisher
-
-            mqtt = MqttPublisher(config.mqtt)
-            outputs.append(mqtt)
-        if config.metrics.listen:
-            try:
-                from risaf_link.publish.metrics import Metrics
-            except ImportError:
-                raise ConfigError(
-                    "metrics.listen: needs prometheus-client: install risaf-link with the extra "
-                    "`metrics`"
-                ) from None
-            metrics = Metrics(config.metrics, self.account, mqtt.counts if mqtt else None)
-            outputs.insert(0, metrics)  # what the others take is no latency of ours
-        return outputs
-
     def _tell(self, notice: Notice) -> None:
         """Let outputs know what the operator is told."""
         unix_us = self._clock_us()
-        for output in self._outputs:
-            try:
-                output.tell(notice, self.pipeline.now_us(unix_us), unix_us)
-            except Exception:
-                self._leave_out(output)
-
-    async def _run_output(self, output: Output) -> None:
-        try:
-            await output.run()
-        except Exception:
-            self._leave_out(output)
-
-    def _leave_out(self, output: Output) -> None:
-        """Go on without an output that has failed."""
-        _log.exception("%s has failed and is left out", type(output).__name__)
-        self._outputs = [other for other in self._outputs if other is not output]
+        self._outputs.tell(notice, self.pipeline.now_us(unix_us), unix_us)
 
     def _tell_mismatch(self) -> None:
         if self.pipeline.mismatch != self._mismatch:
@@ -442,6 +319,8 @@ class Service:
             now_us = round(loop.time() * 1e6)
             gathered = self.pipeline.assembler.counts["epochs"]
             is_alive = self._component.note_gathered(gathered, now_us)
+            for recording in self._recordings:
+                self._component.complaints[f"recording {recording.name}"] = recording.trouble
             self._component.advance(now_us, self._clock_us())
             self._hand_out(self._component.collect(self._peers()))
             self._supervisor.tell(loop.time(), lambda: self._component.status, is_alive)

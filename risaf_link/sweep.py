@@ -21,14 +21,14 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from functools import cache
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from pathlib import Path
-from threading import Thread
 from typing import Any, Protocol
 
 import msgspec
 
 from risaf_link.errors import ConfigError, RisafError
+from risaf_link.parent import end_with
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 ATTEMPTS = 4  # at a case whose worker dies; as many as Dask makes by default
@@ -186,19 +186,9 @@ class _Worker:
     @staticmethod
     def _process() -> ProcessPoolExecutor:
         context = get_context("spawn")
-        return ProcessPoolExecutor(1, mp_context=context, initializer=_end_with_parent)
-
-
-def _end_with_parent() -> None:
-    """Let this process end with the one that started it, however that ends."""
-    parent = parent_process()
-
-    def watch() -> None:
-        if parent:
-            parent.join()
-            os._exit(1)
-
-    Thread(target=watch, daemon=True).start()
+        return ProcessPoolExecutor(
+            1, mp_context=context, initializer=end_with, initargs=(os.getpid(),)
+        )
 
 
 def _on_cores(cases: Sequence[Work], workers: int) -> Iterator[tuple[Work, Outcome]]:

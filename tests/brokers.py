@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ports import free_port
 
 SAFETY_S = 30.0
 TURN_S = 0.005  # from one look at something outside to the next
@@ -42,13 +43,6 @@ async def until(condition: Callable[[], Any]) -> None:
             await asyncio.sleep(TURN_S)
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
 def accepts(port: int) -> bool:
     with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
         return True
@@ -59,7 +53,7 @@ class Running:
     """A broker in a process of its own, that may be killed and come back on its port."""
 
     def __init__(self, directory: Path) -> None:
-        self.port = free_port()
+        self.port = free_port(socket.SOCK_STREAM)
         self.directory = directory
         self._process: subprocess.Popen[bytes] | None = None
 

@@ -1,9 +1,11 @@
 """Settings for all tests."""
 
+import asyncio
 import os
 
 import filters
 import pytest
+from daemon import Ground
 from hypothesis import settings
 
 from risaf_link.core import kernel
@@ -41,3 +43,12 @@ def cutter(request):
         if request.param == "python":
             patch.setattr(frame, "cut", search.cut)
         yield
+
+
+@pytest.fixture
+async def ground():
+    """A UDP socket that feeds a service and listens to it."""
+    loop = asyncio.get_running_loop()
+    transport, protocol = await loop.create_datagram_endpoint(Ground, local_addr=("127.0.0.1", 0))
+    yield protocol
+    transport.close()

@@ -5,9 +5,8 @@ import json
 import mimu4444
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import call
 
-from risaf_link.cli import main
 from risaf_link.config import load, load_calibration
 from risaf_link.core.array import Calibration
 from risaf_link.core.calibration import calibrate
@@ -16,10 +15,6 @@ from risaf_link.core.rotation import matrix_from_quaternion
 
 NONE = np.zeros((0, 3))
 HALF = 1875  # epochs
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def turned(seconds=12.0, amplitude=(60.0, 60.0, 60.0), sensors=6, seed=1):

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from command import call
 
 from risaf_link import __version__
-from risaf_link.cli import main
 from risaf_link.core.kernel import BUILT
 from risaf_link.mavlink.dialect import pack
 from risaf_link.mavlink.frame import encode
@@ -21,10 +21,6 @@ from risaf_link.mavlink.tlog import record
 
 ROOT = Path(__file__).parents[1]
 DRIVE = ROOT / "sitl_fixtures" / "rover_sitl_fixture.tlog"
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def assert_one_line(result: Result, status: int, *parts: str) -> None:

@@ -16,6 +16,7 @@ from random import Random
 import numpy as np
 import pytest
 import yaml
+from ports import free_port
 from streams import parsed
 from wire import frame
 
@@ -45,12 +46,6 @@ UNSIGNED_SET = bytes(
         param_type=9,
     ).raw
 )
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
 
 
 class Running:

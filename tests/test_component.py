@@ -47,6 +47,7 @@ ESTIMATE = an_estimate()
 
 def at(time_s: float, **changes) -> Estimate:
     estimate = copy(ESTIMATE)
+    changes = {"heading": ESTIMATE.heading} | changes  # it would be made of the other changes
     vars(estimate).update(time_us=round(time_s * 1e6), elapsed=time_s, **changes)
     return estimate
 
@@ -514,6 +515,14 @@ class TestNotices:
         network.component.trouble = "x" * 120
         said = texts(network.wait(1)[NEAR])
         assert said == ["no estimates: " + "x" * 120]
+
+    def test_a_complaint_is_told_once_and_when_it_has_gone(self, network):
+        complaints = network.component.complaints
+        complaints["recording log"] = "/var: No space left on device"
+        wrong = "recording log: /var: No space left on device"
+        assert texts(network.wait(60)[NEAR]) == [wrong]
+        complaints["recording log"] = ""
+        assert texts(network.wait(60)[NEAR]) == ["recording log: in order again"]
 
     @pytest.mark.parametrize("length", [36, 37, 86, 87])
     def test_the_last_chunk_is_never_full_of_more_than_one(self, network, length):

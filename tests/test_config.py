@@ -106,7 +106,12 @@ def test_settings_go_over_the_file(tmp_path):
         ),
         (
             "links: [{name: a, url: 'tlog:///a.tlog'}, {name: b, url: 'tlog:///a.tlog'}]",
-            "links.1.url: found 'tlog:///a.tlog' twice, expected once",
+            "links.1.url: found 'tlog:///a.tlog' beside the recording /a.tlog, expected names that "
+            "no segment of another has",
+        ),
+        (
+            "links: [{name: a, url: 'tlog:///a.12.tlog'}, {name: b, url: 'tlog:///b/../a.tlog'}]",
+            "links.1.url: found 'tlog:///b/../a.tlog' beside the recording /a.12.tlog, ",
         ),
         (
             "links: [{name: a, url: 'udpin://x:1', recording: {}}]",
@@ -168,6 +173,12 @@ def test_one_line_says_key_found_and_expected(tmp_path, text, message):
 def test_a_wrong_setting_is_named(setting, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
         load(None, [setting])
+
+
+def test_recordings_of_different_names_may_lie_beside_each_other():
+    for other in ("/b.tlog", "/a.b.tlog", "/a.1.2.tlog", "/a.01.tlog", "/c/a.1.tlog"):
+        links = f"links=[{{name: a, url: 'tlog:///a.tlog'}}, {{name: b, url: 'tlog://{other}'}}]"
+        assert len(load(None, [links]).links) == 2
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -13,10 +13,9 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import call
 from msgspec import Struct
 
-from risaf_link.cli import main
 from risaf_link.errors import ConfigError, RisafError
 from risaf_link.experiments import drives
 from risaf_link.experiments.allan import allan_deviation, coefficients
@@ -32,10 +31,6 @@ def cases(seeds=3):
         Case("circle", seed, ("mean", "ours"), ((2.0, 4.0),), duration=4.0, sensors=5)
         for seed in range(seeds)
     ]
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 class Endless(Struct, frozen=True):

@@ -5,10 +5,9 @@ import os
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command import call
 from logs import simulated, timeless
 
-from risaf_link.cli import main
 from risaf_link.config import Config, load
 from risaf_link.errors import ConfigError
 from risaf_link.fleet import names, replay_all
@@ -18,10 +17,6 @@ from risaf_link.sweep import execute
 from risaf_link.words import fleet_text
 
 SELECTION = Selection(outages=((3.0, 6.0),))
-
-
-def call(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture

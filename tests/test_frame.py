@@ -223,13 +223,16 @@ def pieces():
     return st.lists(st.one_of(good, damaged, st.binary(max_size=20), marks), max_size=12)
 
 
-@settings(max_examples=200)
-@given(
+PIECES_AND_CHUNKS = given(
     pieces(),
     st.sampled_from([0, 8]),
     st.lists(st.integers(0, 400), max_size=12),
     st.randoms(use_true_random=False),
 )
+
+
+@settings(max_examples=200)
+@PIECES_AND_CHUNKS
 def test_frames_and_counts_are_the_same_whatever_the_chunks(parts, prefix_size, sizes, random):
     stream = b"".join(random.randbytes(random.choice((0, prefix_size))) + part for part in parts)
     whole, parser = parsed([stream], prefix_size)
@@ -252,12 +255,7 @@ def test_the_parser_never_holds_more_than_a_frame_and_what_is_around_it(parts, p
 
 
 @settings(max_examples=200)
-@given(
-    pieces(),
-    st.sampled_from([0, 8]),
-    st.lists(st.integers(0, 400), max_size=12),
-    st.randoms(use_true_random=False),
-)
+@PIECES_AND_CHUNKS
 def test_both_forms_find_the_same_in_every_piece(parts, prefix_size, sizes, random):
     stream = b"".join(random.randbytes(random.choice((0, prefix_size))) + part for part in parts)
     for cut in (chunks(stream, sizes), chunks(stream, [1] * len(stream))):

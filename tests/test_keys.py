@@ -7,17 +7,16 @@ from pathlib import Path
 import msgspec
 import pytest
 import yaml
-from streams import KEY, parsed
-from test_service import (
+from daemon import (
     EPOCHS,
     Running,
     address_of,
     bursts,
     config_for,
     feed,
-    ground,  # noqa: F401
     until,
 )
+from streams import KEY, parsed
 from test_signing import OTHER_KEY, setup, signed
 from wire import frame
 
@@ -177,7 +176,7 @@ def test_a_damaged_state_is_told_and_left_out(tmp_path, caplog):
     assert "found signing.key.state damaged" in caplog.text
 
 
-async def test_a_key_that_is_set_up_is_kept_and_nowhere_else(ground, tmp_path, caplog):  # noqa: F811
+async def test_a_key_that_is_set_up_is_kept_and_nowhere_else(ground, tmp_path, caplog):
     path, recording = tmp_path / "signing.key", tmp_path / "drive.tlog"
     signing = f"signing: {{key: '{path}', setup: true}}"
     whole = config_for(
@@ -201,7 +200,7 @@ async def test_a_key_that_is_set_up_is_kept_and_nowhere_else(ground, tmp_path, c
     assert open_keys(whole).links["setup"].accepts(signed(stored(path).ticks, key=OTHER_KEY))
 
 
-async def test_what_is_rejected_is_neither_used_nor_recorded(ground, tmp_path):  # noqa: F811
+async def test_what_is_rejected_is_neither_used_nor_recorded(ground, tmp_path):
     path, recording = key_file(tmp_path), tmp_path / "drive.tlog"
     whole = config_for(
         ground,
@@ -223,7 +222,7 @@ async def test_what_is_rejected_is_neither_used_nor_recorded(ground, tmp_path): 
     assert recorded == [good.raw]
 
 
-async def test_a_signed_array_is_taken_whole_and_an_unsigned_one_not_at_all(ground, tmp_path):  # noqa: F811
+async def test_a_signed_array_is_taken_whole_and_an_unsigned_one_not_at_all(ground, tmp_path):
     signing = {"key": str(key_file(tmp_path))}
     whole = config_for(ground)
     array, output = whole.links

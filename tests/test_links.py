@@ -6,8 +6,10 @@ import gc
 import os
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
+from functools import partial
 from pathlib import Path
 
+import ports
 import pytest
 
 from risaf_link.links import (
@@ -79,9 +81,7 @@ def port_of(link: UdpInLink | TcpInLink) -> int:
 
 @pytest.fixture
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        return int(probe.getsockname()[1])
+    return ports.free_port(socket.SOCK_STREAM)
 
 
 class Device:
@@ -127,21 +127,18 @@ def device(tmp_path: Path) -> Iterator[Device]:
 
 
 @contextlib.asynccontextmanager
-async def udp_pair(host: str = HOST) -> AsyncIterator[tuple[Link, Inbox, Link, Inbox]]:
-    server = UdpInLink("server", host, 0)
+async def network_pair(
+    listening: type[TcpInLink | UdpInLink], calling: type[TcpOutLink | UdpOutLink], host: str = HOST
+) -> AsyncIterator[tuple[Link, Inbox, Link, Inbox]]:
+    server = listening("server", host, 0)
     async with running(server) as [at_server]:
-        client = UdpOutLink("client", host, port_of(server))
+        client = calling("client", host, port_of(server))
         async with running(client) as [at_client]:
             yield server, at_server, client, at_client
 
 
-@contextlib.asynccontextmanager
-async def tcp_pair(host: str = HOST) -> AsyncIterator[tuple[Link, Inbox, Link, Inbox]]:
-    server = TcpInLink("server", host, 0)
-    async with running(server) as [at_server]:
-        client = TcpOutLink("client", host, port_of(server))
-        async with running(client) as [at_client]:
-            yield server, at_server, client, at_client
+udp_pair = partial(network_pair, UdpInLink, UdpOutLink)
+tcp_pair = partial(network_pair, TcpInLink, TcpOutLink)
 
 
 @contextlib.asynccontextmanager

@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from command import call
 from logs import simulated
 from matplotlib.colors import to_rgb
 from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 from vehicle import SCALE, Vehicle
 
-from risaf_link.cli import main
 from risaf_link.config import Config, load
 from risaf_link.core.health import Reason, SensorState
 from risaf_link.judgement import heading_verdict, sensor_rows
@@ -34,10 +33,6 @@ from risaf_link.report import page, shaded
 HOSTILE = "<script>alert(1)</script>"
 START_US = 1_800_000_000_000_000
 PICTURES = ("heading", "errors", "innovations", "biases", "rates", "tilt", "health", "array")
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 class Page(HTMLParser):

@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import pytest
 from brokers import SAFETY_S, until
+from daemon import EPOCHS, Running, bursts, config_for, feed
 from estimates import estimates
 from msgspec import structs
 from prometheus_client.parser import text_string_to_metric_families
-from test_service import EPOCHS, Running, bursts, config_for, feed, ground  # noqa: F401
 
 from risaf_link.errors import ConfigError
 from risaf_link.publish import scrape
@@ -24,7 +24,7 @@ from risaf_link.service import Service
 ANYWHERE = MetricsParameters("127.0.0.1:0")
 
 
-def metered(ground, **sections):  # noqa: F811
+def metered(ground, **sections):
     return structs.replace(config_for(ground), metrics=ANYWHERE, **sections)
 
 
@@ -55,12 +55,12 @@ async def figures(port: int) -> dict[tuple[str, ...], float]:
 
 
 async def port_of(service: Service) -> int:
-    (metrics,) = service._outputs
+    (metrics,) = service._outputs.running
     await until(lambda: metrics.page.port)
     return metrics.page.port
 
 
-async def test_the_page_tells_what_the_service_counted(ground):  # noqa: F811
+async def test_the_page_tells_what_the_service_counted(ground):
     async with Running(metered(ground), up=2) as service:
         port = await port_of(service)
         before = await figures(port)
@@ -81,7 +81,7 @@ async def test_the_page_tells_what_the_service_counted(ground):  # noqa: F811
     assert sum(v for name, v in after.items() if name[0] == "risaf_link_heading_state") == 1
 
 
-async def test_latencies_are_a_histogram_of_what_a_clock_beside_it_says(ground):  # noqa: F811
+async def test_latencies_are_a_histogram_of_what_a_clock_beside_it_says(ground):
     loop = asyncio.get_running_loop()
     async with Running(metered(ground), up=2) as service:
         port, began = await port_of(service), loop.time()
@@ -96,7 +96,7 @@ async def test_latencies_are_a_histogram_of_what_a_clock_beside_it_says(ground):
     assert 0 < found["risaf_link_latency_seconds_sum",] < passed
 
 
-async def test_garbage_and_drops_are_told_by_reason(ground):  # noqa: F811
+async def test_garbage_and_drops_are_told_by_reason(ground):
     async with Running(metered(ground), up=2) as service:
         port = await port_of(service)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -140,13 +140,13 @@ async def test_innovations_and_deviations_are_those_of_the_last_estimate():
     assert found["risaf_link_heading_fused_total",] == estimate.heading.fused_count
 
 
-async def test_who_asks_and_does_not_go_on_costs_no_epoch(ground):  # noqa: F811
+async def test_who_asks_and_does_not_go_on_costs_no_epoch(ground):
     async with Running(metered(ground), up=2) as service, contextlib.AsyncExitStack() as stack:
         port = await port_of(service)
         for k in range(scrape.MOST_AT_ONCE):
             idle = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
             idle.sendall(b"GET /metrics HTTP/1.1\r\n" + b"\r\n" * (k % 2))  # half never end
-        (metrics,) = service._outputs
+        (metrics,) = service._outputs.running
         await until(lambda: len(metrics.page._answering) >= scrape.MOST_AT_ONCE // 2)
         assert len(await feed(ground, service, bursts())) == EPOCHS
 
@@ -185,7 +185,7 @@ async def test_it_is_read_and_nothing_else(request_, status):
 
 
 async def test_a_port_that_is_taken_is_told_once_and_the_service_goes_on(
-    ground,  # noqa: F811
+    ground,
     caplog,
     monkeypatch,
 ):
@@ -200,17 +200,17 @@ async def test_a_port_that_is_taken_is_told_once_and_the_service_goes_on(
     assert told == [f"metrics: down: {taken}: Address already in use"]
 
 
-async def test_an_output_that_fails_ends_alone(ground, caplog):  # noqa: F811
+async def test_an_output_that_fails_ends_alone(ground, caplog):
     async with Running(metered(ground), up=2) as service:
-        (metrics,) = service._outputs
-        before = service._outputs
+        (metrics,) = service._outputs.running
+        before = service._outputs.running
         metrics.take = None  # whatever goes wrong in it
         assert len(await feed(ground, service, bursts())) == EPOCHS
-        assert (len(before), service._outputs) == (1, [])
+        assert (len(before), service._outputs.running) == (1, [])
     assert caplog.messages.count("Metrics has failed and is left out") == 1
 
 
-def test_without_the_extra_it_says_what_to_install(ground, monkeypatch):  # noqa: F811
+def test_without_the_extra_it_says_what_to_install(ground, monkeypatch):
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
     monkeypatch.delitem(sys.modules, "risaf_link.publish.metrics")
     with pytest.raises(ConfigError, match=r"metrics\.listen: .* with the extra `metrics`"):

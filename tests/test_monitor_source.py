@@ -8,14 +8,20 @@ from itertools import count
 import msgspec
 import numpy as np
 import pytest
+from aiohttp import ClientSession
 from aiohttp.test_utils import TestClient, TestServer
+from click.testing import CliRunner
+from pymavlink.dialects.v20 import all as public
+from streams import KEY
 from test_monitor import LEVEL, NOW_US, STATUS, taken, told
 from wire import SERVICE, frame
 
+from risaf_link.cli import main
 from risaf_link.errors import ConfigError, LogError
 from risaf_link.links import MemoryLink
-from risaf_link.mavlink.dialect import IDS
-from risaf_link.mavlink.frame import FrameParser
+from risaf_link.mavlink.dialect import IDS, pack
+from risaf_link.mavlink.frame import FrameParser, encode
+from risaf_link.mavlink.signing import LinkSigning, SigningKey, SigningParameters
 from risaf_link.mavlink.tlog import TlogReader, record
 from risaf_link.monitor.recording import FASTEST, Player, Recording, open_recording
 from risaf_link.monitor.server import application, serve
@@ -147,7 +153,7 @@ def test_a_page_is_sent_what_it_does_not_have_yet(recording):
 
 def test_what_is_not_known_is_null_for_the_page():
     class Still:
-        name, player, now_us, vehicles = "link", None, NOW_US, Vehicles()
+        name, player, now_us, vehicles, rejected = "link", None, NOW_US, Vehicles(), {}
 
     told(Still.vehicles, "GPS_HEADING_STATUS", **{**STATUS, "yaw": float("nan")})
     sent = json.loads(msgspec.json.encode(View(Still()).update()))
@@ -175,6 +181,49 @@ async def test_a_live_page_asks_and_listens():
         for task in running:
             task.cancel()
     assert live.vehicles.estimators[SERVICE].heading is not None
+
+
+async def test_a_page_with_a_key_signs_what_it_asks_and_shows_only_what_is_signed_with_it():
+    key, other, unknown = SigningKey(KEY), SigningKey(bytes(range(1, 33))), (7, 191)
+    signing = LinkSigning(SigningKey(KEY), 0, SigningParameters("key"))
+    here, there = MemoryLink("page", "signed"), MemoryLink("service", "signed")
+    live = Live("memory://signed", here, count(NOW_US, 100_000).__next__, signing)
+    codec = public.MAVLink(None)
+    codec.signing.secret_key, asked = KEY, []
+
+    def status(who, sign) -> bytes:
+        return encode(*pack("GPS_HEADING_STATUS", time_usec=0, **STATUS), 0, *who, sign)
+
+    def hear(data: bytes, _: str) -> None:
+        asked.extend(codec.parse_buffer(data) or [])  # raises where a signature is wrong
+        for one in (key, other):
+            one.advance(NOW_US + 60_000_000)  # a vehicle whose clock is ahead
+        there.send(status(SERVICE, lambda content: key.signature(content, 3)))
+        there.send(status(unknown, lambda content: other.signature(content, 3)))
+        there.send(status(unknown, None))
+
+    async with asyncio.TaskGroup() as tasks:
+        running = [tasks.create_task(there.run(hear)), tasks.create_task(live.run())]
+        async with asyncio.timeout(SAFETY_S):
+            while "COMMAND_LONG" not in [message.get_type() for message in asked]:
+                await asyncio.sleep(0)
+        for task in running:
+            task.cancel()
+    assert all(message.get_signed() for message in asked)
+    assert list(live.vehicles.estimators) == [SERVICE]
+    update = View(live).update()
+    assert update.rejected.keys() == {"signature", "unsigned"}
+
+
+def test_a_log_and_a_key_do_not_go_together(tmp_path):
+    path = tmp_path / "signing.key"
+    path.write_bytes(KEY)
+    told = CliRunner().invoke(main, ["monitor", "drive.tlog", "--key", str(path)])
+    assert (told.exit_code, told.stderr.count("\n")) == (2, 1)
+    path.chmod(0o644)
+    told = CliRunner().invoke(main, ["monitor", "udpin://127.0.0.1:0", "--key", str(path)])
+    assert told.exit_code == 2
+    assert f"--key: {path}: found signing.key with mode 0644" in told.stderr
 
 
 @asynccontextmanager
@@ -230,6 +279,16 @@ async def test_another_name_for_this_machine_is_refused(recording):
         assert (await client.get("/", headers={"Host": "localhost:8765"})).status == 200
     async with browsing(Log("drive.tlog", Player(recording)), host="10.0.0.7") as client:
         assert (await client.get("/", headers={"Host": "boat.local"})).status == 200
+
+
+async def test_a_page_on_ipv6_tells_a_url_that_a_browser_takes(recording):
+    urls: asyncio.Queue[str] = asyncio.Queue()
+    source = Log("drive.tlog", Player(recording))
+    serving = asyncio.create_task(serve(source, "::1", 0, urls.put_nowait))
+    async with ClientSession() as session, session.get(await urls.get()) as page:
+        assert page.status == 200
+    serving.cancel()
+    await asyncio.wait([serving])
 
 
 async def test_a_port_that_is_taken_is_said_in_one_line(recording):

@@ -12,10 +12,11 @@ import sys
 import numpy as np
 import pytest
 import trustme
-from brokers import SAFETY_S, Amqtt, Listener, Mosquitto, Proxy, free_port, until
+from brokers import SAFETY_S, Amqtt, Listener, Mosquitto, Proxy, until
+from daemon import EPOCHS, Running, bursts, config_for, feed
 from estimates import estimates
 from msgspec import structs
-from test_service import EPOCHS, Running, address_of, bursts, config_for, feed, ground  # noqa: F401
+from ports import free_port
 
 from risaf_link.core.rotation import euler_from_quaternion
 from risaf_link.mavlink.notices import Notice, Severity
@@ -246,20 +247,20 @@ class TestNothingToldIsLost:
 class TestTheServiceGoesOn:
     """Every epoch is answered, whatever the broker does."""
 
-    async def every_epoch_is_answered(self, ground, port: int) -> None:  # noqa: F811
+    async def every_epoch_is_answered(self, ground, port: int) -> None:
         chosen = parameters(port, rates=MqttRates(attitude=1000.0))
         config = structs.replace(config_for(ground), mqtt=chosen)
         async with Running(config, up=2) as service:
             assert len(await feed(ground, service, bursts())) == EPOCHS
-            (publisher,) = service._outputs
+            (publisher,) = service._outputs.running
             waiting = publisher.counts().waiting
             assert waiting["attitude"] <= config.mqtt.states_kept
             assert waiting["attitude"] + publisher.counts().dropped["attitude"] == EPOCHS
 
-    async def test_without_a_broker(self, ground):  # noqa: F811
-        await self.every_epoch_is_answered(ground, free_port())
+    async def test_without_a_broker(self, ground):
+        await self.every_epoch_is_answered(ground, free_port(socket.SOCK_STREAM))
 
-    async def test_with_one_that_takes_connections_and_never_answers(self, ground):  # noqa: F811
+    async def test_with_one_that_takes_connections_and_never_answers(self, ground):
         with socket.create_server(("127.0.0.1", 0)) as silent:
             await self.every_epoch_is_answered(ground, silent.getsockname()[1])
 
@@ -404,7 +405,7 @@ class TestTls:
 
 
 class TestTheRealProcess:
-    async def test_the_broker_says_that_it_was_killed(self, broker, ground):  # noqa: F811
+    async def test_the_broker_says_that_it_was_killed(self, broker, ground):
         links = f"links=[{{name: ground, url: 'udpout://127.0.0.1:{ground.port}'}}]"
         mqtt = f"mqtt={{url: 'mqtt://127.0.0.1:{broker.port}', vehicle: v}}"
         command = [sys.executable, "-m", "risaf_link.cli", "run", "--set", links, "--set", mqtt]

@@ -14,7 +14,7 @@ import pytest
 from autopilots import ArduPilot, Px4, yaw_of
 from hypothesis import given
 from hypothesis import strategies as st
-from network import OWN, Network, acks, of, public
+from network import NEAR, OWN, Network, acks, of, public, texts
 from streams import ROOT, recording
 from vehicle import Vehicle
 from wire import frame
@@ -119,6 +119,25 @@ class TestWhatIsSent:
         assert not feed.go(1, course=1.0)
         feed.beat(PX4)
         assert feed.go(1, course=1.0)
+
+    def test_the_operator_is_told_once_that_no_autopilot_is_known(self):
+        feed = Feed()
+        feed.go(2, course=1.0)
+        wrong = (
+            "ODOMETRY: not sent: neither PX4 nor ArduPilot is heard, and mavlink.odometry is auto"
+        )
+        assert wrong not in texts(feed.wait(9)[PEER])
+        assert texts(feed.wait(60)[PEER]) == [wrong]
+        feed.beat(PX4)
+        assert texts(feed.wait(60)[PEER]) == ["ODOMETRY: in order again"]
+
+    def test_nothing_is_told_where_nobody_wants_it_or_an_autopilot_is_heard_in_time(self):
+        unwanted = Network()
+        assert not texts(unwanted.wait(60)[NEAR])
+        feed = Feed()
+        feed.wait(9)
+        feed.beat(ARDUPILOT)
+        assert not texts(feed.wait(60)[PEER])
 
     def test_another_vehicles_autopilot_changes_nothing(self):
         feed = Feed(PX4)

@@ -45,7 +45,7 @@ class Bench:
     @property
     def files(self) -> dict[str, list[int]]:
         """Which records each file holds."""
-        found = sorted(self.folder.iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        found = sorted(self.folder.iterdir(), key=lambda path: (len(path.name), path.name))
         return {path.name: list(path.read_bytes()[::100]) for path in found if path.is_file()}
 
     @property

@@ -218,6 +218,39 @@ def test_of_two_links_with_the_same_autopilot_the_first_is_asked():
     assert vehicle.asked_at == {NEAR: 5}
 
 
+def brought(vehicle: Vehicle, rates: dict[str, float], peer, seconds: float) -> set[str]:
+    """Let the autopilot speak on its own account by one way, besides; what it was asked for."""
+    streams = Autopilot(EVERYTHING)
+    streams.rates = dict(rates)
+    asked = []
+    for _ in range(round(10 * seconds)):
+        raw = b"".join(each.raw for each in streams.frames(0.1))
+        vehicle.net.component.note_traffic(FrameParser().receive_table(raw), peer)
+        asked += vehicle.wait(0.1)
+    return {name for name, _ in asked}
+
+
+def test_what_comes_by_a_link_on_which_nothing_is_asked_for_is_not_asked_for_on_a_later_one():
+    vehicle = Vehicle(Autopilot(EVERYTHING), Requests({"vehicle": {}, "ground": None}))
+    vehicle.peers = [NEAR]
+    all_but_time = {**dict.fromkeys(ALL, 100.0), "GPS_RAW_INT": 5.0}
+    del all_but_time["SYSTEM_TIME"]
+    assert brought(vehicle, all_but_time, VEHICLE, 30) == {"SYSTEM_TIME"}
+    assert brought(vehicle, {}, VEHICLE, 30) == ALL - {"SYSTEM_TIME"}
+
+
+def test_what_comes_by_a_later_link_is_asked_for_all_the_same():
+    vehicle = Vehicle(Autopilot(EVERYTHING))
+    assert "GPS_RAW_INT" in brought(vehicle, {"GPS_RAW_INT": 5.0}, NEAR, 30)
+
+
+def test_what_comes_twice_too_slowly_is_too_slow():
+    vehicle = Vehicle(Autopilot(EVERYTHING), Requests({"vehicle": {}, "ground": None}))
+    vehicle.peers = [NEAR]
+    vehicle.autopilot.rates["GPS_RAW_INT"] = 2.0
+    assert "GPS_RAW_INT" in brought(vehicle, {"GPS_RAW_INT": 2.0}, VEHICLE, 30)
+
+
 def test_a_link_may_ask_for_other_things_or_for_nothing():
     links = {"vehicle": {}, "ground": {"RAW_IMU": 50.0}}
     vehicle = Vehicle(Autopilot({"RAW_IMU": 1000.0}), Requests(links))  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from risaf_link.sim.faults import FAULTS, OF_CHIPS
 from risaf_link.sim.pace import Pace, SpeedChange
 from risaf_link.sim.readings import readings, strikes
 from risaf_link.sim.receiver import fixes
-from risaf_link.sim.receiver_faults import RECEIVER_FAULTS
+from risaf_link.sim.receiver_faults import RECEIVER_FAULTS, CourseError
 from risaf_link.sim.scenario import CONSUMER_GYROS, scenario
 from risaf_link.sim.sensors import TriadArray, TriadErrors
 from risaf_link.sim.target import Target
@@ -321,6 +321,15 @@ def test_a_course_can_jump_or_drift():
         assert drift[since >= 0.0] == pytest.approx(0.5 * since[since >= 0.0], abs=1e-9)
 
 
+def test_a_course_can_be_off_again_and_again():
+    _, sound = reports("gps_jump", duration=100.0)
+    fault = CourseError(size=1.0, begin=20.0, length=5.0, every=30.0)
+    off = np.abs(fault.spoil(sound).course - sound.course) > 1e-6
+    times_s = sound.time_s
+    expected = ((times_s >= 20) & (times_s < 25)) | ((times_s >= 50) & (times_s < 55))
+    assert np.array_equal(off, expected | ((times_s >= 80) & (times_s < 85)))
+
+
 def test_a_spoofed_way_is_that_of_its_velocity_and_a_drifting_course_is_not():
     for name, agrees in (("gps_spoofed", True), ("gps_drift", False)):
         spoilt, sound = reports(name)
@@ -351,3 +360,11 @@ def test_faults_of_sensors_and_of_the_receiver_are_chosen_alike():
     assert chosen.faults == scenario("drive2", 1).faults
     assert chosen.receiver_faults == {"gps_frozen": RECEIVER_FAULTS["gps_frozen"]}
     assert scenario("drive2", 1).receiver_faults == {}
+
+
+def test_the_receivers_faults_of_a_scenario_are_on_unless_others_are_chosen():
+    own = scenario("demo", 1).receiver_faults
+    assert own["gps_jump"] != RECEIVER_FAULTS["gps_jump"]
+    assert scenario("demo", 1, faults=["default"]).receiver_faults == own
+    assert scenario("demo", 1, faults=["gps_jump"]).receiver_faults == own
+    assert scenario("demo", 1, faults=["spikes"]).receiver_faults == {}

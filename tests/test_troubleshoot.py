@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from risaf_link.mavlink.peers import UNFED
+
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "troubleshoot.md").read_text()
 SOURCES = [path for path in (ROOT / "risaf_link").rglob("*.py") if path.name != "risaf.py"]
@@ -37,7 +39,10 @@ STATUSTEXTS = told("Notice", argument=1)
 WARNINGS = told("warning", "error", "exception") | told("log", argument=1)
 RECALLED = {text for text in told("Verdict", "_give_up") if text.startswith("state")}
 CALIBRATION = {f"gyro calibration {text}" for text in told("end")}
-OTHERS = {r"gyro bias .+ deg/s", r"warm start: .+ ago"}  # put together
+OTHERS = {  # put together
+    *(r"gyro bias .+ deg/s", r"warm start: .+ ago", r"recording .+: .+ bytes are free"),
+    re.escape(f"ODOMETRY: {UNFED}"),
+}
 
 
 def explained(section: str) -> list[str]:

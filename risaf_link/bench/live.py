@@ -131,15 +131,20 @@ def _percentile(values: Sequence[float], percent: int) -> float:
 
 @contextmanager
 def service(
-    meter: Meter, command: Sequence[str], rate: float = 100.0, settings: Sequence[str] = ()
+    meter: Meter,
+    command: Sequence[str],
+    rate: float = 100.0,
+    settings: Sequence[str] = (),
+    links: Sequence[str] = (),
 ) -> Iterator[int]:
     """Run the service beside a meter, for every epoch an attitude; its process id.
 
-    `settings` are `KEY=VALUE` over the defaults.
+    `settings` are `KEY=VALUE` over the defaults, `links` others beside that to the meter, in YAML.
     """
     emit = f"emit: {{ATTITUDE_QUATERNION: {2 * rate}, GPS_HEADING_STATUS: 5, ARRAY_STATUS: 5}}"
     link = f"{{name: meter, url: 'udpout://127.0.0.1:{meter.port}', {emit}}}"
-    told = [part for setting in (f"links=[{link}]", *settings) for part in ("--set", setting)]
+    all_links = f"links=[{', '.join([link, *links])}]"
+    told = [part for setting in (all_links, *settings) for part in ("--set", setting)]
     with _process([*command, "run", *told], meter) as number:
         yield number
 

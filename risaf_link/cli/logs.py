@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from risaf_link.cli.options import Span, configured, opened, progress_over, selected, spread
+from risaf_link.cli.options import Span, configured, progress_over, selected, spread
 from risaf_link.errors import ConfigError, LogError
 
 if TYPE_CHECKING:
@@ -222,23 +222,24 @@ def _sinks(
     """What is to be done with the estimates."""
     from risaf_link.publish.rows import RowWriter
     from risaf_link.replay import OutputLog
+    from risaf_link.whole import written
 
     sinks: list[Sink] = []
     if options["speed"]:
         sinks.append(_pace(options["speed"]))
     if options["out"]:
-        file = files.enter_context(opened(options["out"], "wb"))
+        file = files.enter_context(written(options["out"], "wb"))
         out = OutputLog(config, file, replayed.identity)
         sinks.append(out.write)
     if options["csv"]:
-        rows = RowWriter(files.enter_context(opened(options["csv"], "w")))
+        rows = RowWriter(files.enter_context(written(options["csv"], "w")))
         sinks.append(rows.write)
     if options["mcap"]:
         from risaf_link.publish.mcap import McapWriter, require
 
         require()
-        mcap = McapWriter(files.enter_context(opened(options["mcap"], "wb")), log.name)
-        files.callback(mcap.finish)
+        file = files.enter_context(written(options["mcap"], "wb"))
+        mcap = files.enter_context(McapWriter(file, log.name))
         replayed.truth_listeners.append(mcap.take_truth)
         replayed.scorer.listeners.append(mcap.take_errors)
         sinks.append(mcap.take)

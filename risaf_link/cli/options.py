@@ -2,13 +2,15 @@
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
-from risaf_link.errors import ConfigError, RisafError
+from risaf_link.address import address_in
+from risaf_link.errors import RisafError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -44,10 +46,10 @@ class Address(click.ParamType[Any]):
         """Read it."""
         if isinstance(value, tuple):
             return value
-        host, _, port = value.rpartition(":")
-        if not host or not port.isdecimal() or int(port) > 65535:
+        found = address_in(value)
+        if found is None:
             self.fail(f"found {value!r}, expected ADDRESS:PORT, such as 0.0.0.0:8765", param, ctx)
-        return host, int(port)
+        return found
 
 
 def configured(command: Command) -> Command:
@@ -124,6 +126,17 @@ def rooted(command: Command) -> Command:
     )(command)
 
 
+def interrupted(command: Callable[..., None]) -> Callable[..., None]:
+    """Take Ctrl-C for the end that it is, also before the command has quite begun."""
+
+    @wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        with suppress(KeyboardInterrupt):
+            command(*args, **kwargs)
+
+    return run
+
+
 @contextmanager
 def extra(name: str) -> Iterator[None]:
     """Say which extra is missing where an import fails."""
@@ -133,14 +146,6 @@ def extra(name: str) -> Iterator[None]:
         raise RisafError(
             f"needs {error.name}: install risaf-link with the extra `{name}`"
         ) from None
-
-
-def opened(path: Path, mode: str) -> Any:
-    """Open a file that the user has named."""
-    try:
-        return path.open(mode)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from None
 
 
 @contextmanager

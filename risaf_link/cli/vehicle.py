@@ -6,12 +6,20 @@ from typing import Any
 
 import click
 
-from risaf_link.cli.options import configured, extra, listening, opened, progress_over, rooted
+from risaf_link.cli.options import (
+    configured,
+    extra,
+    interrupted,
+    listening,
+    progress_over,
+    rooted,
+)
 
 
 @click.command()
 @configured
 @click.option("-v", "--verbose", is_flag=True, help="Say more, such as which peers come and go.")
+@interrupted
 def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> None:
     """Run the service until it is interrupted.
 
@@ -26,7 +34,8 @@ def run(config_path: Path | None, settings: tuple[str, ...], verbose: bool) -> N
 
     from risaf_link.config import load
     from risaf_link.kept import kept_parameters
-    from risaf_link.service import Service, loop_factory, settled, until_told
+    from risaf_link.loop import loop_factory, settled, until_told
+    from risaf_link.service import Service
     from risaf_link.supervisor import of_this_process
 
     level = logging.INFO if verbose else logging.WARNING
@@ -139,8 +148,9 @@ def simulate(
         raise click.UsageError("expected --out LOG.tlog or --live URL")
     if out:
         from risaf_link.mavlink.tlog import record
+        from risaf_link.whole import written
 
-        with opened(out, "wb") as file:
+        with written(out, "wb") as file:
             for time_us, raw in frames(chosen):
                 file.write(record(record_time_us(time_us), raw))
     if url:
@@ -148,7 +158,7 @@ def simulate(
 
         from risaf_link.links import open_link
         from risaf_link.links.play import play
-        from risaf_link.service import unix_us, until_told
+        from risaf_link.loop import unix_us, until_told
 
         link = open_link(url, "--live", unix_us)
         asyncio.run(until_told(play(frames(chosen), link)))
@@ -158,8 +168,15 @@ def simulate(
 
 @click.command()
 @click.argument("source", metavar="URL|LOG")
+@click.option(
+    "--key",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Signing key of the link: show only what is signed with it, and sign what is sent.",
+)
 @listening
-def monitor(source: str, listen: tuple[str, int]) -> None:
+@interrupted
+def monitor(source: str, key: Path | None, listen: tuple[str, int]) -> None:
     """Show vehicles on a page in the browser: live from a link, or from a log.
 
     A URL is one of those that `run` takes. The page finds the risaf_link components there, asks
@@ -168,7 +185,7 @@ def monitor(source: str, listen: tuple[str, int]) -> None:
 
     \b
     risaf-link monitor udpin://0.0.0.0:14550
-    risaf-link monitor udpout://192.168.1.10:14560
+    risaf-link monitor udpout://192.168.1.10:14560 --key signing.key
     risaf-link monitor drive.tlog
     """
     import asyncio
@@ -176,16 +193,21 @@ def monitor(source: str, listen: tuple[str, int]) -> None:
 
     with extra("monitor"):
         from risaf_link.monitor.server import serve
+    from risaf_link.errors import ConfigError
+    from risaf_link.keys import open_key
     from risaf_link.links import open_link
+    from risaf_link.loop import unix_us, until_told
     from risaf_link.monitor.recording import Player, open_recording
     from risaf_link.monitor.source import Live, Log, Source
-    from risaf_link.service import unix_us, until_told
 
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     path = Path(source.removeprefix("tlog://"))
     shown: Source
     if "://" in source and not source.startswith("tlog://"):
-        shown = Live(source, open_link(source, "URL", unix_us), unix_us)
+        signing = open_key(key, "--key") if key else None
+        shown = Live(source, open_link(source, "URL", unix_us), unix_us, signing)
+    elif key:
+        raise ConfigError("--key: found it with a log, expected it with a link")
     else:
         with progress_over(path) as progress:
             shown = Log(path.name, Player(open_recording(path, progress)))
@@ -199,6 +221,7 @@ def _tell_page(url: str) -> None:
 @click.command()
 @click.option("--seed", type=int, default=1, metavar="N", help="Of the drive and its faults.")
 @listening
+@interrupted
 def demo(seed: int, listen: tuple[str, int]) -> None:
     """Show it all without hardware: a simulated vehicle, the service, and the page.
 
@@ -212,7 +235,7 @@ def demo(seed: int, listen: tuple[str, int]) -> None:
 
     with extra("monitor"):
         from risaf_link.demo import demo as show
-    from risaf_link.service import unix_us, until_told
+    from risaf_link.loop import unix_us, until_told
 
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     tell = partial(click.echo, err=True)

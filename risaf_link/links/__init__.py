@@ -4,12 +4,13 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from risaf_link.address import HOST
 from risaf_link.errors import LinkError
 from risaf_link.links.link import Link, LinkCounts, Receive
 from risaf_link.links.memory import MemoryLink
 from risaf_link.links.serial import SerialLink
 from risaf_link.links.tcp import TcpInLink, TcpOutLink
-from risaf_link.links.tlog import RecordingParameters, TlogLink
+from risaf_link.links.tlog import RecordingParameters, TlogLink, overlap
 from risaf_link.links.udp import UdpInLink, UdpOutLink
 
 __all__ = [
@@ -25,10 +26,10 @@ __all__ = [
     "UdpInLink",
     "UdpOutLink",
     "open_link",
+    "overlap",
 ]
 
-_LABEL = r"[A-Za-z0-9_-]{1,63}"
-_HOST_PORT = rf"({_LABEL}(?:\.{_LABEL})*|\[[0-9A-Fa-f:.]+(?:%\w+)?\]):([0-9]{{1,9}})"
+_HOST_PORT = rf"({HOST}):([0-9]{{1,9}})"
 _FORMS = {
     "serial": ("serial:///dev/NAME:BAUD", r"(/.+):([0-9]{1,9})"),
     "udpin": ("udpin://ADDRESS:PORT", _HOST_PORT),

@@ -39,6 +39,12 @@ Numbered = tuple[int, Message]
 Tell = Callable[[dict[str, Any]], None]
 
 
+def names_of(name: str) -> str:
+    """A pattern of what the files of a recording are called, with the number of each."""
+    stem, suffix = os.path.splitext(name)
+    return re.escape(stem) + r"(?:\.([1-9][0-9]*))?" + re.escape(suffix)
+
+
 def _tell_nobody(_: dict[str, Any]) -> None:
     pass
 
@@ -90,6 +96,7 @@ class Recording:
     ) -> None:
         self._directory, name = os.path.split(path)
         self._stem, self._suffix = os.path.splitext(name)
+        self._names = names_of(name)
         self._segment_bytes = min(segment_bytes, most_bytes // SHARE_OF_ALL or segment_bytes)
         self._segment_s = segment_s
         self._most_bytes = most_bytes
@@ -189,11 +196,10 @@ class Recording:
 
     def _found(self) -> list[tuple[int, str, int | None]]:
         """Numbers, paths and sizes of what bears the recording's names; None: no file."""
-        pattern = re.escape(self._stem) + r"(?:\.([1-9][0-9]*))?" + re.escape(self._suffix)
         found = []
         with os.scandir(self._directory) as entries:
             for entry in entries:
-                name = re.fullmatch(pattern, entry.name)
+                name = re.fullmatch(self._names, entry.name)
                 if name:
                     is_file = entry.is_file(follow_symlinks=False)
                     size = entry.stat(follow_symlinks=False).st_size if is_file else None

@@ -6,6 +6,7 @@ import itertools
 import json
 import logging
 import os
+import re
 import select
 import subprocess
 import sys
@@ -42,6 +43,13 @@ class RecordingParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 DEFAULTS = RecordingParameters()
+
+
+def overlap(one: Path, other: Path) -> bool:
+    """Whether two recordings would have files of the same name."""
+    return one.parent.resolve() == other.parent.resolve() and any(
+        re.fullmatch(recorder.names_of(a.name), b.name) for a, b in ((one, other), (other, one))
+    )
 
 
 class Pipes:
@@ -148,6 +156,11 @@ class TlogLink(Link):
         self._failure: str | None = None  # that it told of; None: nothing yet
         self._told_lost = 0
         self._next_telling_s = 0.0
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing is written just now; empty: it is, or will be soon."""
+        return self._failure or ""
 
     def record(self, received_us: int, *frames: bytes) -> None:
         """Record frames that were received."""

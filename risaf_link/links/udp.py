@@ -119,21 +119,12 @@ class UdpOutLink(OnePeerLink):
 class UdpInLink(Link):
     """Datagrams from whoever speaks to us; all of them are answered.
 
+    Parameters and attributes are those of `TcpInLink`, and
+
     Parameters
     ----------
-    name : str
-        What the log calls it.
-    host, port : str, int
-        Where it listens; with port 0 the system chooses one.
-    backoff : Backoff
-        How long it waits before it listens again.
     now_s : Callable
         A clock, seconds, that never jumps.
-
-    Attributes
-    ----------
-    address : str
-        Where it listens in fact, once it does.
     """
 
     def __init__(

@@ -10,7 +10,6 @@ and where it was not, others may: we are silent.
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from enum import IntEnum
 from typing import Any, Protocol
 
 from risaf_link import __version__
@@ -28,6 +27,7 @@ from risaf_link.mavlink.peers import ANY, EMITTED, Peers, Terms
 from risaf_link.mavlink.pulse import Pulse
 from risaf_link.mavlink.requests import Requests
 from risaf_link.mavlink.signing import KEY_SIZE, SETUP_SIGNING, setup_in
+from risaf_link.mavlink.storage import NO_PLACE, Storage
 from risaf_link.mavlink.telemetry import heartbeat
 from risaf_link.mavlink.tuning import Answer, Tuning
 
@@ -68,14 +68,6 @@ class Estimator(Protocol):
         """What the clock of the estimates shows, us, at a time since 1970."""
 
 
-class StorageAction(IntEnum):
-    """PREFLIGHT_STORAGE_PARAMETER_ACTION, as far as it is understood."""
-
-    READ = 0
-    WRITE = 1
-    RESET = 2
-
-
 class Component:
     """One component of the vehicle.
 
@@ -98,6 +90,8 @@ class Component:
     ----------
     trouble : str
         Why there are no estimates, for the operator.
+    complaints : dict
+        What else may be wrong to what is wrong with it, for the operator; empty: nothing.
     """
 
     def __init__(
@@ -112,6 +106,7 @@ class Component:
         listen: Callable[[Notice], None] | None = None,
     ) -> None:
         self.trouble = ""
+        self.complaints: dict[str, str] = {}
         self._parameters = parameters
         self._tuned = parameters.tuned
         self._estimator = estimator
@@ -121,8 +116,7 @@ class Component:
         self._peers = Peers(*identity.own, parameters.tuned.emit, self._links)
         self._peers.feed(identity.profile)
         self._pace = {name: terms.pace for name, terms in self._links.items()}
-        self._keep = keep
-        self._stored = dict(parameters.kept)
+        self._storage = Storage(parameters, keep)
         self._tuning = Tuning(parameters)
         self._notices = Notices()
         self._told = 0  # notices
@@ -132,7 +126,6 @@ class Component:
         self._received_us = 0
         self._calibration = GyroCalibration(estimator.set_bias)
         self._pulse = Pulse()
-        self._storing: Order | None = None
         self._advanced_us: int | None = None
         self._commands: dict[int, Callable[[Order], Result]] = {
             Command.PREFLIGHT_CALIBRATION: self._calibrate,
@@ -212,7 +205,9 @@ class Component:
             self._outbox.append((None, "HEARTBEAT", heartbeat(self._pulse.state)))
         if self._pulse.has_stalled:
             self._report(self._calibration.end("failed: no samples"))
-        for notice in self._notices.due(now_us, self._pulse.has_stalled, self.trouble):
+        self.complaints["ODOMETRY"] = self._peers.complaint(now_us)
+        stalled = self._pulse.has_stalled
+        for notice in self._notices.due(now_us, stalled, self.trouble, self.complaints):
             self._tell(notice)
         for peer, fields in self._requests.advance(now_us):
             self._outbox.append((peer, "COMMAND_LONG", fields))
@@ -225,13 +220,11 @@ class Component:
 
     def kept(self, parameters: dict[str, float], failure: str = "") -> None:
         """Take note that parameters were stored, or why they were not."""
-        order, self._storing = self._storing, None
+        told = self._storage.end(parameters, failure)
         if failure:
-            self._tell(Notice(Severity.ERROR, f"parameters not stored: {failure}"))
-        else:
-            self._stored = parameters
-        if order:
-            self._acknowledge(order, Result.FAILED if failure else Result.ACCEPTED)
+            self._tell_not_stored(failure)
+        if told:
+            self._acknowledge(*told)
 
     @property
     def status(self) -> str:
@@ -400,35 +393,17 @@ class Component:
         return Result.ACCEPTED
 
     def _store(self, order: Order) -> Result:
-        action = order.integer
-        if action not in set(StorageAction):
-            return Result.DENIED
-        if self._storing:
-            same = (self._storing.asker, self._storing.parameters) == (
-                order.asker,
-                order.parameters,
-            )
-            return Result.IN_PROGRESS if same else Result.TEMPORARILY_REJECTED
-        if action == StorageAction.WRITE:
-            return self._begin_to_store(order)
-        self._parameters.reset()
-        if action == StorageAction.READ:
-            for name, value in self._stored.items():
-                self._parameters.set(name, value)
-        self._take_effect()
-        for peer in {*self._peers.known(), order.peer}:
-            self._tuning.list_to(peer)
-        if action == StorageAction.RESET and self._stored:
-            return self._begin_to_store(order)
-        return Result.ACCEPTED
+        result, is_new = self._storage.obey(order)
+        if is_new:
+            self._take_effect()
+            for peer in {*self._peers.known(), order.peer}:
+                self._tuning.list_to(peer)
+        if result is Result.FAILED:
+            self._tell_not_stored(NO_PLACE)
+        return result
 
-    def _begin_to_store(self, order: Order) -> Result:
-        if self._keep is None:
-            self._tell(Notice(Severity.ERROR, "parameters not stored: no configuration file"))
-            return Result.FAILED
-        self._storing = order
-        self._keep(dict(self._parameters.kept))
-        return Result.IN_PROGRESS
+    def _tell_not_stored(self, why: str) -> None:
+        self._tell(Notice(Severity.ERROR, f"parameters not stored: {why}"))
 
     def _calibrate(self, order: Order) -> Result:
         wanted = order.told

@@ -89,6 +89,11 @@ def reader(name: str, *fields: str) -> Callable[[bytes], tuple[Any, ...]]:
     return read
 
 
+def text_of(field: bytes) -> str:
+    """Text of a field, which ends at the first NUL."""
+    return field.partition(b"\0")[0].decode(errors="replace")
+
+
 def pack(name: str, /, **fields: Any) -> tuple[int, bytes]:
     """Lay out a message's payload, whole: no trailing zeros cut.
 

@@ -16,7 +16,7 @@ from msgspec import Struct
 from risaf_link.core.heading import GpsFix
 from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.choice import Choice, Streams
-from risaf_link.mavlink.dialect import IDS, name_of, reader
+from risaf_link.mavlink.dialect import IDS, name_of, reader, text_of
 from risaf_link.mavlink.epoch import MAX_SENSORS, ArrayParameters, GyroChunk, Source
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.gps import READERS, GpsMessage
@@ -242,7 +242,7 @@ class Ingest:
             self.counts["malformed"] += 1
             return
         info = ArrayInfo(
-            _text(name),
+            text_of(name),
             scale,
             limit if limit > 0 else math.inf,
             accel_scale if 0 < accel_scale < math.inf else math.nan,
@@ -290,8 +290,8 @@ class Ingest:
 
     def _debug_float_array(self, frame: Frame, received_us: int) -> GyroChunk | None:
         time_us, name, first, data = _DEBUG(frame.payload)
-        is_gyro = _text(name) == "gyro"
-        if not is_gyro and _text(name) != "accel":
+        is_gyro = text_of(name) == "gyro"
+        if not is_gyro and text_of(name) != "accel":
             return None
         source = Source(frame.system, frame.component, "DEBUG_FLOAT_ARRAY", 0)
         if not self._admits(source, time_us, received_us, is_gyro):
@@ -377,11 +377,6 @@ class Ingest:
         if not repeated:
             _remember(self._last_fixes, receiver, (fix.time_us, payload))
         return repeated
-
-
-def _text(field: bytes) -> str:
-    """Text of a field, which ends at the first NUL."""
-    return field.partition(b"\0")[0].decode(errors="replace")
 
 
 def _remember(memory: dict[Key, Value], key: Key, value: Value) -> None:

@@ -1,6 +1,7 @@
 """What the operator is told in words, STATUSTEXT: changes of state, and not too often."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -51,7 +52,9 @@ class Notices:
         if before and estimate.time_us < before.time_us:
             self._clock_resets += 1
 
-    def due(self, now_us: int, has_stalled: bool, trouble: str) -> list[Notice]:
+    def due(
+        self, now_us: int, has_stalled: bool, trouble: str, complaints: Mapping[str, str]
+    ) -> list[Notice]:
         """What is to be told now.
 
         Parameters
@@ -62,9 +65,12 @@ class Notices:
             No epochs come, though they did.
         trouble : str
             Why there are no estimates; empty: there are, or nothing has come.
+        complaints : mapping
+            What else may be wrong to what is wrong with it; empty: nothing.
         """
         silent = has_stalled and not trouble
         notices = [self._of_samples(now_us, silent), self._of_trouble(now_us, trouble)]
+        notices += [self._of_complaint(now_us, *each) for each in complaints.items()]
         if self._estimate:
             notices += self._of_estimate(self._estimate, now_us)
         return [notice for notice in notices if notice]
@@ -80,6 +86,13 @@ class Notices:
         if not self._changed("trouble", trouble, "", now_us) or not trouble:
             return None
         return Notice(Severity.ERROR, f"no estimates: {trouble}")
+
+    def _of_complaint(self, now_us: int, what: str, wrong: str) -> Notice | None:
+        if not self._changed(f"complaint: {what}", wrong, "", now_us):
+            return None
+        if wrong:
+            return Notice(Severity.WARNING, f"{what}: {wrong}")
+        return Notice(Severity.INFO, f"{what}: in order again")
 
     def _of_estimate(self, estimate: Estimate, now_us: int) -> list[Notice | None]:
         attitude, health = estimate.attitude, estimate.array.health

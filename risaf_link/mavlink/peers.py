@@ -16,6 +16,9 @@ MOST_PEERS = 256  # that are remembered
 FASTEST_US = 100.0  # shortest interval of a message: the array's rate is less anyway
 LARGEST_INTERVAL_US = 2**31 - 1
 
+UNFED_US = 10_000_000  # that ODOMETRY may wait for the autopilot's HEARTBEAT
+UNFED = "not sent: neither PX4 nor ArduPilot is heard, and mavlink.odometry is auto"
+
 EMITTED: dict[int, Message] = {IDS[name]: name for name in get_args(Message)}
 """Messages that may be asked for, by their ids."""
 
@@ -52,6 +55,7 @@ class Peers:
         self._rates = rates
         self._links = links
         self._profile: Profile | None = None
+        self._unfed_us: int | None = None  # since when somebody waits for ODOMETRY in vain
         self._emitters: dict[Peer, Emitter] = {}
 
     def emitter(self, peer: Peer) -> Emitter:
@@ -93,6 +97,22 @@ class Peers:
             self._profile = profile
             for emitter in self._emitters.values():
                 emitter.profile = profile
+
+    def complaint(self, now_us: int) -> str:
+        """What is wrong with ODOMETRY: for long nobody has told in which form it is wanted.
+
+        Parameters
+        ----------
+        now_us : int
+            Microseconds of a clock that does not jump.
+        """
+        wanted = any("ODOMETRY" in emitter.rates for emitter in self._emitters.values())
+        if self._profile or not wanted:
+            self._unfed_us = None
+        elif self._unfed_us is None:
+            self._unfed_us = now_us
+        unfed = self._unfed_us is not None and now_us - self._unfed_us >= UNFED_US
+        return UNFED if unfed else ""
 
     def ask(self, peer: Peer, message_id: int, interval_us: float) -> bool:
         """Let a peer have a message so often, -1 not at all, 0 by default; whether that can be."""

@@ -12,6 +12,7 @@ second, before the next is made.
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
@@ -19,7 +20,7 @@ from typing import Annotated, Any, Literal, get_args
 from msgspec import Meta
 
 from risaf_link.mavlink.commands import Command, Peer, Result
-from risaf_link.mavlink.dialect import IDS, MESSAGES, reader
+from risaf_link.mavlink.dialect import IDS, MESSAGES, reader, text_of
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.identity import autopilot_mode
 
@@ -70,7 +71,7 @@ class _Need:
     rate: float  # Hz, wanted
     best: float = 0.0  # Hz, of what came of requests
     is_most: bool = False  # more than the best does not come
-    count: int = 0  # of messages since
+    counts: Counter[Peer] = field(default_factory=Counter)  # of messages since, by way
     since_us: int = 0
     lacks: bool = False  # as last measured
     asked: bool = False  # since it was last measured
@@ -94,11 +95,13 @@ class _Need:
 
     def begin(self, now_us: int) -> None:
         """Measure anew."""
-        self.count, self.since_us, self.lacks = 0, now_us, False
+        self.counts.clear()
+        self.since_us, self.lacks = now_us, False
 
     def measure(self, now_us: int) -> None:
         """Judge a window that has passed."""
-        rate = self.count / ((now_us - self.since_us) / 1e6)
+        count = max(self.counts.values(), default=0)  # the same comes by several ways
+        rate = count / ((now_us - self.since_us) / 1e6)
         self.begin(now_us)
         if self.asked:
             self.best = max(self.best, rate)
@@ -153,7 +156,8 @@ class Requests:
     """Asks the vehicle's autopilot for messages, on one link at a time.
 
     Of several links on which it is heard, the first in order is asked: a radio that carries the
-    same vehicle to the ground is not burdened.
+    same vehicle to the ground is not burdened. What comes by that link counts, or by one before it,
+    where nothing is asked for; what comes by one behind it may have come a long way round.
 
     Parameters
     ----------
@@ -176,7 +180,7 @@ class Requests:
         capacity: Mapping[str, float] | None = None,
     ) -> None:
         self._links = {name: rates for name, rates in links.items() if rates != {}}
-        self._order = {name: i for i, name in enumerate(self._links)}
+        self._order = {name: i for i, name in enumerate(links)}
         self._encodings = frozenset(encodings)
         self._gps = gps
         self._capacity = dict(capacity or {})
@@ -190,13 +194,14 @@ class Requests:
         ids = table.cuts["message_id"].tolist()
         if GYRO_ARRAY in ids and "GYRO_ARRAY" in self._encodings:
             self._array_us = self._now_us
-        if peer != self._at:
+        if self._at is None or self._order[peer[0]] > self._order[self._at[0]]:
             return
-        sender, needs = self._autopilots[peer].sender, self._autopilots[peer].needs
+        sender, needs = self._autopilots[self._at].sender, self._autopilots[self._at].needs
         systems, components = table.cuts["system"].tolist(), table.cuts["component"].tolist()
         for message_id, *whose in zip(ids, systems, components, strict=True):
             for need in needs:
-                need.count += need.message_id == message_id and tuple(whose) == sender
+                if need.message_id == message_id and tuple(whose) == sender:
+                    need.counts[peer] += 1
 
     def hear(self, frame: Frame, peer: Peer, own: tuple[int, int]) -> None:
         """Take a frame that tells of an autopilot, or of an array that is not in our dialect.
@@ -247,7 +252,7 @@ class Requests:
         return self._at
 
     def _hear_array(self, frame: Frame) -> None:
-        is_gyro = _DEBUG(frame.payload)[0].rstrip(b"\0") == b"gyro"
+        is_gyro = text_of(_DEBUG(frame.payload)[0]) == "gyro"
         if is_gyro and "DEBUG_FLOAT_ARRAY" in self._encodings:
             self._array_us = self._now_us
 

@@ -22,10 +22,11 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Annotated
 
+import numpy as np
 from msgspec import Meta, Struct
 
 from risaf_link.mavlink.dialect import IDS, reader
-from risaf_link.mavlink.frame import Frame
+from risaf_link.mavlink.frame import Frame, FrameTable
 
 KEY_SIZE = 32
 TICKS_PER_S = 100_000
@@ -255,6 +256,11 @@ class LinkSigning:
         if rejection:
             self.rejected[rejection] += 1
         return rejection is None
+
+    def taken(self, table: FrameTable) -> FrameTable:
+        """Those frames of a table that are taken; the others are counted."""
+        taken = [self.accepts(table.frame(row)) for row in range(len(table))]
+        return FrameTable(table.buffer, table.cuts[np.array(taken, bool)])
 
     @property
     def sign(self) -> Callable[[bytes], bytes] | None:

@@ -9,7 +9,7 @@ from enum import IntEnum
 from typing import Any
 
 from risaf_link.mavlink.commands import Peer, concerns
-from risaf_link.mavlink.dialect import IDS, reader
+from risaf_link.mavlink.dialect import IDS, reader, text_of
 from risaf_link.mavlink.frame import Frame
 from risaf_link.mavlink.parameters import Parameters
 
@@ -66,10 +66,10 @@ class Tuning:
             return []
         if frame.message_id == IDS["PARAM_REQUEST_READ"]:
             *to, name, index = _READ(frame.payload)
-            return list(self._read(_text(name), index, to, own, asker))
+            return list(self._read(text_of(name), index, to, own, asker))
         if frame.message_id == IDS["PARAM_SET"]:
             *to, name, value, kind = _SET(frame.payload)
-            return list(self._set(_text(name), value, kind, to, own, asker))
+            return list(self._set(text_of(name), value, kind, to, own, asker))
         return []
 
     def list_to(self, peer: Peer) -> None:
@@ -153,7 +153,3 @@ def _error(error: ParamError, name: str, index: int, asker: tuple[int, int]) -> 
         "error": error,
     }
     return Answer("PARAM_ERROR", fields)
-
-
-def _text(field: bytes) -> str:
-    return field.partition(b"\0")[0].decode("ascii", "replace")

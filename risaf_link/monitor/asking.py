@@ -14,6 +14,7 @@ from risaf_link.mavlink.commands import Command
 from risaf_link.mavlink.dialect import IDS, pack
 from risaf_link.mavlink.frame import encode
 from risaf_link.mavlink.identity import NO_AUTOPILOT
+from risaf_link.mavlink.signing import LinkSigning
 from risaf_link.mavlink.telemetry import ONBOARD_CONTROLLER, Rates
 from risaf_link.mavlink.timesync import request
 from risaf_link.monitor.vehicles import COMPONENT, Vehicles, Who
@@ -39,9 +40,16 @@ WANTED: Rates = {
 
 
 class Asking:
-    """Asks, as time goes by."""
+    """Asks, as time goes by.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    signing : LinkSigning or None
+        How the link is signed.
+    """
+
+    def __init__(self, signing: LinkSigning | None = None) -> None:
+        self._signing = signing
         self._asked: dict[tuple[Who, str], int] = {}  # when
         self._next_us = self._next_timesync_us = -math.inf
         self._sequence = 0
@@ -82,7 +90,8 @@ class Asking:
         return next(due, None)
 
     def _frame(self, name: str, **fields: Any) -> bytes:
-        frame = encode(*pack(name, **fields), self._sequence, SYSTEM, COMPONENT)
+        sign = self._signing.sign if self._signing else None
+        frame = encode(*pack(name, **fields), self._sequence, SYSTEM, COMPONENT, sign)
         self._sequence = (self._sequence + 1) % 256
         return frame
 

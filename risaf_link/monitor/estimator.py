@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from risaf_link.core.rotation import euler_from_quaternion
-from risaf_link.mavlink.dialect import IDS, reader
+from risaf_link.mavlink.dialect import IDS, reader, text_of
 from risaf_link.mavlink.frame import Frame
 
 HISTORY_S, STEP_S = 600, 0.2  # how far back it is remembered, and how finely
@@ -250,7 +250,7 @@ class Estimator:
 
     def _take_named(self, payload: bytes) -> None:
         name, value = _NAMED(payload)
-        text = name.rstrip(b"\0").decode("ascii", "replace")
+        text = text_of(name)
         if text in NAMES:
             self.named[text] = value
 

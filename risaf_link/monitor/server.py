@@ -12,13 +12,14 @@ from pathlib import Path
 import msgspec
 from aiohttp import web
 
+from risaf_link.address import shown
 from risaf_link.errors import ConfigError
 from risaf_link.monitor.source import Source
 from risaf_link.monitor.view import View
 
 PAGE = Path(__file__).parent / "page"
 PERIOD_S = 0.1  # from one update to the next
-LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -58,11 +59,11 @@ async def serve(source: Source, host: str, port: int, started: Callable[[str], N
     await runner.setup()
     try:
         try:
-            await web.TCPSite(runner, host.strip("[]"), port).start()
+            await web.TCPSite(runner, host, port).start()
         except OSError as error:
             reason = error.strerror or error
-            raise ConfigError(f"--listen {host}:{port}: {reason}") from None
-        started(f"http://{host}:{runner.addresses[0][1]}")
+            raise ConfigError(f"--listen {shown(host, port)}: {reason}") from None
+        started(f"http://{shown(host, runner.addresses[0][1])}")
         await source.run()
     finally:
         await runner.cleanup()

@@ -1,13 +1,14 @@
 """Where the page's frames come from: a link, or a log."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
 
 from risaf_link.links import Link
 from risaf_link.mavlink.frame import FrameParser
+from risaf_link.mavlink.signing import LinkSigning
 from risaf_link.monitor.asking import Asking
 from risaf_link.monitor.recording import Player
 from risaf_link.monitor.vehicles import Vehicles
@@ -33,6 +34,10 @@ class Source(Protocol):
     def player(self) -> Player | None:
         """What plays the log; None: it is live."""
 
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Frames that were not taken for their signatures, by reason."""
+
     async def run(self) -> None:
         """Let frames come until cancelled."""
 
@@ -47,16 +52,25 @@ class Live:
     link : Link
     clock_us : callable
         Microseconds since 1970.
+    signing : LinkSigning or None
+        How the link is signed; None: it is not, and who has signed what comes is not looked at.
     """
 
     player: Player | None = None
 
-    def __init__(self, name: str, link: Link, clock_us: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        name: str,
+        link: Link,
+        clock_us: Callable[[], int],
+        signing: LinkSigning | None = None,
+    ) -> None:
         self.name = name
         self.vehicles = Vehicles()
         self._link = link
         self._clock_us = clock_us
-        self._asking = Asking()
+        self._signing = signing
+        self._asking = Asking(signing)
         self._parsers: dict[str, FrameParser] = {}
         self._latest_us = 0
 
@@ -66,11 +80,18 @@ class Live:
         self._latest_us = max(self._latest_us, self._clock_us())
         return self._latest_us
 
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Frames that were not taken for their signatures, by reason."""
+        return self._signing.rejected if self._signing else {}
+
     async def run(self) -> None:
         """Listen, and ask for what is shown."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._link.run(self._receive))
             while True:
+                if self._signing:
+                    self._signing.key.advance(self.now_us)
                 for raw in self._asking.advance(self.vehicles, self.now_us):
                     self._link.send(raw)
                 await asyncio.sleep(TICK_S)
@@ -81,11 +102,16 @@ class Live:
         if len(self._parsers) > MOST_PEERS:
             del self._parsers[next(iter(self._parsers))]
         table = parser.receive_table(data)
+        if self._signing:
+            self._signing.key.advance(self.now_us)
+            table = self._signing.taken(table)
         self.vehicles.take(table, np.full(len(table), self.now_us, np.uint64), peer)
 
 
 class Log:
     """A recording that is played."""
+
+    rejected: Mapping[str, int] = {}
 
     def __init__(self, name: str, player: Player) -> None:
         self.name = name

@@ -55,6 +55,7 @@ class Update(Struct, frozen=True, omit_defaults=True):
     playback: Playback | None
     is_new: bool  # what was sent before belongs to something else
     heard: list[Heard]
+    rejected: dict[str, int]  # frames that were not taken for their signatures, by reason
     chosen: Who | None
     known: Known | None
     rows: list[Row]
@@ -95,6 +96,7 @@ class View:
             player.playback if player else None,
             is_new,
             _heard(vehicles, now_us),
+            dict(self._source.rejected),
             chosen,
             _known(estimator) if estimator else None,
             self._new_rows(estimator) if estimator else [],

@@ -11,14 +11,13 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 from msgspec import field as default
 
+from risaf_link.address import HOST
 from risaf_link.errors import ConfigError
 from risaf_link.private import read_private
 
 PASSWORD = "RISAF_LINK_MQTT_PASSWORD"  # noqa: S105 where it is found, in the environment
 PORTS = {"mqtt": 1883, "mqtts": 8883}
-URL = re.compile(
-    r"(mqtts?)://([A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)*|\[[0-9A-Fa-f:.]+\])(?::([0-9]{1,5}))?/?"
-)
+URL = re.compile(rf"(mqtts?)://({HOST})(?::([0-9]{{1,5}}))?/?")
 
 Level = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_.-]*$")]
 Rate = Annotated[float, Meta(ge=0, le=1000)]

@@ -59,7 +59,8 @@ class Events:
         events = self._gaps(block)
         if looked:
             self._notices.observe(looked)
-            due = self._notices.due(round(looked.elapsed * 1e6), has_stalled=False, trouble="")
+            elapsed_us = round(looked.elapsed * 1e6)
+            due = self._notices.due(elapsed_us, has_stalled=False, trouble="", complaints={})
             last = len(block) - 1
             events += [_event(block, last, notice.severity, notice.text) for notice in due]
         return events

@@ -9,7 +9,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 import msgspec
 import numpy as np
@@ -68,7 +68,7 @@ class McapWriter:
     Parameters
     ----------
     file : binary file
-        Written to; `finish` ends it.
+        Written to; it ends when the block ends well that the writer is the context of.
     log : str
         Name of what was replayed.
 
@@ -121,10 +121,13 @@ class McapWriter:
         """Write heading errors, as soon as the estimates have come that they are of."""
         self._errors.append(errors)
 
-    def finish(self) -> None:
-        """End the file."""
-        self._write_errors()
-        self._writer.finish()  # type: ignore[no-untyped-call]
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self._write_errors()
+            self._writer.finish()  # type: ignore[no-untyped-call]
 
     def _write_epochs(self, block: EstimateBlock) -> None:
         track = block.track

@@ -23,13 +23,14 @@ from prometheus_client.core import (
 )
 
 from risaf_link import __version__
+from risaf_link.address import address_in
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.heading import HeadingState
 from risaf_link.core.health import Reason, SensorState
 from risaf_link.core.kernel import BUILT
 from risaf_link.mavlink.notices import Notice, Severity
 from risaf_link.publish.account import Account, MqttCounts
-from risaf_link.publish.scrape import MetricsParameters, Page, address
+from risaf_link.publish.scrape import MetricsParameters, Page
 
 BOUNDS_US = (
     *(50, 75, 100, 150, 200, 300, 400, 500, 750),
@@ -89,7 +90,7 @@ class Metrics:
         account: Callable[[], Account],
         mqtt: Callable[[], MqttCounts] | None = None,
     ) -> None:
-        where = address(parameters.listen)
+        where = address_in(parameters.listen)
         if where is None:
             raise ValueError(f"listen: found {parameters.listen!r}, expected ADDRESS:PORT")
         self.page = Page(*where, self._make, CONTENT_TYPE_LATEST)

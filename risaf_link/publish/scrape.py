@@ -6,14 +6,13 @@ It is read, never written to. Whoever is slow is waited for apart, and not for l
 import asyncio
 import logging
 import os
-import re
 from collections.abc import Awaitable, Callable
 
 from msgspec import Struct
 
+from risaf_link.address import address_in, shown
 from risaf_link.errors import ConfigError
 
-LISTEN = re.compile(r"([0-9.]+|localhost|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})")
 PATH = "/metrics"
 PATIENCE_S = 5.0  # with one who asks, all in all
 MOST_AT_ONCE = 8  # who ask; more are turned away
@@ -31,19 +30,11 @@ class MetricsParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 def check(parameters: MetricsParameters, where: str) -> None:
     """Raise ConfigError where there is no such address; `where` stands before it."""
-    if parameters.listen and address(parameters.listen) is None:
+    if parameters.listen and address_in(parameters.listen) is None:
         raise ConfigError(
             f"{where}metrics.listen: found {parameters.listen!r}, expected ADDRESS:PORT, such as "
             "127.0.0.1:9100"
         )
-
-
-def address(listen: str) -> tuple[str, int] | None:
-    """Host and port of ADDRESS:PORT; None: it is nothing of the kind."""
-    found = LISTEN.fullmatch(listen)
-    if found is None or int(found[2]) > 65535:
-        return None
-    return found[1].strip("[]"), int(found[2])
 
 
 class Page:
@@ -82,7 +73,7 @@ class Page:
             except OSError as error:
                 reason = os.strerror(error.errno) if error.errno else str(error)
                 if reason != told:
-                    _log.warning("metrics: down: %s:%d: %s", self._host, self.port, reason)
+                    _log.warning("metrics: down: %s: %s", shown(self._host, self.port), reason)
                 told = reason
             await asyncio.sleep(AGAIN_S)
 
@@ -94,7 +85,7 @@ class Page:
         try:
             await server.start_serving()
             self.port = server.sockets[0].getsockname()[1]
-            _log.info("metrics: up: http://%s:%d%s", self._host, self.port, PATH)
+            _log.info("metrics: up: http://%s%s", shown(self._host, self.port), PATH)
             await asyncio.get_running_loop().create_future()  # until cancelled
         finally:
             server.close()

@@ -42,7 +42,9 @@ WORDS = ("none", "default")
 
 
 def choose(
-    names: Iterable[str] | None, own: Mapping[str, Fault]
+    names: Iterable[str] | None,
+    own: Mapping[str, Fault],
+    own_of_receiver: Mapping[str, ReceiverFault],
 ) -> tuple[dict[str, Fault], dict[str, ReceiverFault]]:
     """Switch faults on.
 
@@ -51,8 +53,9 @@ def choose(
     names : iterable of str or None
         Of `FAULTS` and `RECEIVER_FAULTS`; `default` stands for the scenario's own, `none` for
         nothing. None: its own.
-    own : mapping
-        A scenario's own faults; where it has one, its parameters hold.
+    own, own_of_receiver : mapping
+        A scenario's own faults, of sensors and of the GPS receiver; where it has one, its
+        parameters hold.
 
     Returns
     -------
@@ -64,12 +67,18 @@ def choose(
     ConfigError
         If there is no such fault.
     """
-    on = set(own) if names is None else set(_expand(names, own))
-    faults = {name: own.get(name, usual) for name, usual in FAULTS.items() if name in on}
-    return faults, {name: usual for name, usual in RECEIVER_FAULTS.items() if name in on}
+    on = set(_expand(["default"] if names is None else names, [*own, *own_of_receiver]))
+    return (
+        {name: own.get(name, usual) for name, usual in FAULTS.items() if name in on},
+        {
+            name: own_of_receiver.get(name, usual)
+            for name, usual in RECEIVER_FAULTS.items()
+            if name in on
+        },
+    )
 
 
-def _expand(names: Iterable[str], own: Mapping[str, Fault]) -> Iterator[str]:
+def _expand(names: Iterable[str], own: Iterable[str]) -> Iterator[str]:
     for name in names:
         if name in FAULTS or name in RECEIVER_FAULTS:
             yield name

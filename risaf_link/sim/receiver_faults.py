@@ -33,10 +33,12 @@ class CourseError:
     slope: float = 0.0  # rad/s
     begin: float = BEGIN  # s
     length: float = LENGTH  # s
+    every: float = math.inf  # s, from one beginning to the next
 
     def spoil(self, fixes: Fixes) -> Fixes:
         """Turn the course."""
         since = fixes.time_s - self.begin
+        since = np.where(since < 0.0, since, np.remainder(since, self.every))
         angle = np.where(_lasts(since, self.length), self.size + self.slope * since, 0.0)
         return replace(fixes, course=_wrapped(fixes.course + angle))
 

@@ -20,7 +20,7 @@ from risaf_link.sim.equipment import (
 from risaf_link.sim.failures import Frozen, Invalid, Saturated
 from risaf_link.sim.faults import FAULTS, choose
 from risaf_link.sim.receiver import ReceiverParameters
-from risaf_link.sim.receiver_faults import ReceiverFault
+from risaf_link.sim.receiver_faults import CourseError, ReceiverFault
 from risaf_link.sim.routes import OUTAGE, PARAN, hills, paved, unpaved
 from risaf_link.sim.sensors import TriadErrors
 from risaf_link.sim.target import Fault
@@ -162,6 +162,10 @@ def _demo(generator: np.random.Generator) -> Scenario:
             "shocks": Shocks(share=0.1, spacing=150.0, peak=radians(20.0), decay=0.3),
             "invalid": Invalid(share=0.1, every=60.0, length=20.0),
         },
+        # Between two outages, and over a while before the next one.
+        receiver_faults={
+            "gps_jump": CourseError(size=radians(45.0), begin=120.0, length=15.0, every=240.0)
+        },
         outages=tuple((start, start + 40.0) for start in np.arange(60.0, duration, 120.0).tolist()),
     )
 
@@ -208,7 +212,7 @@ def scenario(
     if make is None:
         raise ConfigError(f"scenario: {name!r}, expected one of {', '.join(SCENARIOS)}")
     chosen = make(_generator(seed, "route"))
-    of_sensors, of_receiver = choose(faults, chosen.faults)
+    of_sensors, of_receiver = choose(faults, chosen.faults, chosen.receiver_faults)
     return replace(
         chosen,
         seed=seed,

@@ -127,6 +127,13 @@ function showHeard(update) {
     h.trip_us === null ? "–" : number(h.trip_us / 1000, 1),
     words.ageText((update.now_us - h.heard_us) / 1e6).replace(" s", ""),
   ]));
+  $("refused").hidden = !refused(update);
+  text("refused", refused(update));
+}
+
+function refused(update) {
+  const counts = Object.entries(update.rejected).map(([reason, count]) => `${number(count)} ${words.REJECTIONS[reason] ?? reason}`);
+  return counts.length ? `Frames refused: ${counts.join(", ")}.` : "";
 }
 
 function showEvents(update) {
@@ -151,7 +158,7 @@ function showFreshness(update, silence) {
   body.add(silence === null ? "waiting" : isStale ? "stale" : "fresh");
   const kind = update.playback ? "log" : "live";
   text("freshness", silence === null ? `${kind}: nothing yet` : `${kind} · last message ${words.ageText(silence)} ago`);
-  const others = update.heard.length ? `${update.heard.length} other component${update.heard.length > 1 ? "s" : ""} heard, see Links.` : "Nothing is heard at all.";
+  const others = update.heard.length ? `${update.heard.length} other component${update.heard.length > 1 ? "s" : ""} heard, see Links.` : refused(update) || "Nothing is heard at all.";
   text("notice", silence === null ? `No risaf_link component is heard${update.playback ? " up to this point of the log" : " yet"}. ${others}`
     : isStale ? `No data for ${words.ageText(silence)}: what is shown is old.` : "");
 }

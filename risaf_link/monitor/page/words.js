@@ -7,6 +7,7 @@ export const STATES = [ // RISAF_HEADING_STATE: word, class, sign
 export const DEAD_RECKONING = 5;
 export const SOURCES = ["nothing yet", "velocity", "positions", "positions, raw", "two antennas"];
 export const SENSOR_STATES = ["healthy", "suspect", "dead"];
+export const REJECTIONS = { unsigned: "not signed", signature: "signed with another key", replayed: "not later than the one before", late: "late", future: "from the future", streams: "of too many senders" };
 export const REASONS = ["", "settling", "wandering", "outlying", "frozen", "silent"];
 export const SEVERITIES = ["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"];
 const AUTOPILOTS = { 3: "ArduPilot", 12: "PX4" }; // MAV_AUTOPILOT
