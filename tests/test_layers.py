@@ -16,6 +16,7 @@ LAYERS = [
     {"config", "sweep"},
     {"kept"},
     {"keys", "remembered", "supervisor", "install"},
+    {"gate"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench", "demo"},
     {"judgement"},

@@ -45,20 +45,40 @@ async def test_udp_peers_are_named_and_all_are_answered(
         assert link.counts.bytes_out == 2 * len(FRAME)
 
 
-async def test_the_udp_peer_silent_longest_gives_way_to_a_new_one(
+async def test_the_udp_peer_silent_longest_gives_way_once_it_has_missed_five_heartbeats(
     udp_socket: Callable[[], socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(udp, "MOST_PEERS", 2)
-    link = UdpInLink("ground", HOST, 0)
+    now_s = 1000.0
+    link = UdpInLink("ground", HOST, 0, now_s=lambda: now_s)
     first, second, third = udp_socket(), udp_socket(), udp_socket()
     async with running(link) as [inbox]:
-        for count, peer in enumerate([first, second, first, third], start=1):
+        for count, (later_s, peer) in enumerate([(0.0, first), (4.0, second), (2.0, third)], 1):
+            now_s += later_s
             peer.sendto(b"here", (HOST, port_of(link)))
             await until(lambda n=count: len(inbox) == n)
         link.send(FRAME)
-        assert await receive_from(first) == await receive_from(third) == FRAME
+        assert await receive_from(second) == await receive_from(third) == FRAME
         with pytest.raises(BlockingIOError):
-            second.recv(4096)
+            first.recv(4096)
+
+
+async def test_strangers_do_not_drive_out_the_udp_peers_that_are_there(
+    udp_socket: Callable[[], socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "MOST_PEERS", 2)
+    link = UdpInLink("ground", HOST, 0, now_s=lambda: 1000.0)
+    peers, strangers = [udp_socket(), udp_socket()], [udp_socket() for _ in range(50)]
+    async with running(link) as [inbox]:
+        for count, peer in enumerate(peers, 1):
+            peer.sendto(b"here", (HOST, port_of(link)))
+            await until(lambda n=count: len(inbox) == n)
+        for stranger in strangers:
+            stranger.sendto(b"here", (HOST, port_of(link)))
+        await until(lambda: link.counts.dropped_in == len(strangers))
+        assert len(inbox) == 2
+        link.send(FRAME)
+        assert [await receive_from(peer) for peer in peers] == [FRAME, FRAME]
 
 
 async def test_a_udp_peer_silent_for_a_minute_is_forgotten(
@@ -132,7 +152,7 @@ async def test_a_tcp_peer_that_vanishes_is_noticed_at_both_ends() -> None:
         client = TcpOutLink("autopilot", HOST, port_of(server))
         async with running(client):
             await until(lambda: server._clients)
-            for end in *server._clients, client._endpoint:
+            for end in *server._clients.values(), client._endpoint:
                 probed = end._transport.get_extra_info("socket")
                 assert probed.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
                 assert probed.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 15_000
@@ -153,4 +173,4 @@ async def test_one_tcp_client_too_many_is_refused(
                 await until(lambda: second.counts.connections == 2)  # was closed, tried again
                 first.send(b"2")
                 await until(lambda: inbox.stream == b"12")
-    assert "ground: no more than 1 peers" in told(caplog)
+    assert "ground: too much comes: 1 not heard so far" in told(caplog)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from risaf_link.errors import LinkError
-from risaf_link.links.link import Link, LinkCounts, Receive
+from risaf_link.links.link import Link, LinkCounts, Receive, Worth
 from risaf_link.links.memory import MemoryLink
 from risaf_link.links.serial import SerialLink
 from risaf_link.links.tcp import TcpInLink, TcpOutLink
@@ -24,6 +24,7 @@ __all__ = [
     "TlogLink",
     "UdpInLink",
     "UdpOutLink",
+    "Worth",
     "open_link",
 ]
 

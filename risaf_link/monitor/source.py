@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from risaf_link.links import Link
+from risaf_link.links import Link, Worth
 from risaf_link.mavlink.frame import FrameParser
 from risaf_link.monitor.asking import Asking
 from risaf_link.monitor.recording import Player
@@ -75,13 +75,14 @@ class Live:
                     self._link.send(raw)
                 await asyncio.sleep(TICK_S)
 
-    def _receive(self, data: bytes, peer: str) -> None:
+    def _receive(self, data: bytes, peer: str) -> Worth:
         parser = self._parsers.pop(peer, None) or FrameParser()
         self._parsers[peer] = parser
         if len(self._parsers) > MOST_PEERS:
             del self._parsers[next(iter(self._parsers))]
         table = parser.receive_table(data)
         self.vehicles.take(table, np.full(len(table), self.now_us, np.uint64), peer)
+        return Worth.SAMPLES if table.cuts["known"].any() else Worth.NOTHING  # all of it is shown
 
 
 class Log:
