@@ -1,0 +1,54 @@
+"""See that an sdist or a wheel holds what it should, and nothing else.
+
+An sdist: what is under version control, and its metadata. A wheel: the package, with the kernel and
+the data that it reads.
+"""
+
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path, PurePosixPath
+
+NOT_IN_THE_WHEEL = ("risaf_link/core/native/", "risaf_link/mavlink/native/")
+
+
+def tracked() -> set[str]:
+    """What is under version control."""
+    command = ["git", "-c", "safe.directory=*", "ls-files", "-z"]
+    return set(subprocess.check_output(command, text=True).rstrip("\0").split("\0"))  # noqa: S603
+
+
+def of_sdist(path: Path) -> tuple[set[str], set[str]]:
+    """What is in it, and what should be."""
+    with tarfile.open(path) as archive:
+        names = {member.name.partition("/")[2] for member in archive if not member.isdir()}
+    return names, tracked() | {"PKG-INFO"}
+
+
+def of_wheel(path: Path) -> tuple[set[str], set[str]]:
+    """What is in it, but for the metadata, and what should be."""
+    with zipfile.ZipFile(path) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    kernel = {name for name in names if PurePosixPath(name).match("risaf_link/core/_kernel.*.so")}
+    expected = {
+        f"risaf_link/{name}" if name.startswith("packaging/") else name
+        for name in tracked()
+        if name.startswith(("risaf_link/", "packaging/")) and not name.startswith(NOT_IN_THE_WHEEL)
+    }
+    return names, expected | (kernel or {"risaf_link/core/_kernel.*.so"})
+
+
+def main() -> None:
+    """Say what is missing or too much, and fail then."""
+    path = Path(sys.argv[1])
+    found, expected = of_wheel(path) if path.suffix == ".whl" else of_sdist(path)
+    wrong = [f"missing: {name}" for name in sorted(expected - found)]
+    wrong += [f"stray: {name}" for name in sorted(found - expected)]
+    if wrong:
+        sys.exit("\n".join([f"{path.name}:", *wrong]))
+    print(f"{path.name}: {len(found)} files, as it should be")
+
+
+if __name__ == "__main__":
+    main()
