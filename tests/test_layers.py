@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "risaf_link"
 LAYERS = [
-    {"errors"},
+    {"errors", "document"},
     {"private"},
     {"core"},
     {"mavlink"},

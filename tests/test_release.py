@@ -1,4 +1,4 @@
-"""What is released: one version, a changelog that tells of it, and an environment that is pinned."""
+"""What is released: one version, a changelog that tells of it, a pinned environment."""
 
 import re
 import tomllib
