@@ -32,6 +32,7 @@ HOST = "127.0.0.1"
 SENSORS = 150
 SETTLE_S = 2.0  # of the array alone
 TURN_S = 0.002  # from one burst of the strangers to the next
+MOST_A_TURN = 500  # of them
 KINDS = ("garbage", "frames", "readings", "orders")
 TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -68,7 +69,7 @@ def strangers(kind: str, port: int, rate: float, sources: int) -> None:
     what = datagrams(kind, 997)
     began, sent = time.monotonic(), 0
     while True:
-        due = int((time.monotonic() - began) * rate)
+        due = min(int((time.monotonic() - began) * rate), sent + MOST_A_TURN)
         for number in range(sent, due):
             sockets[number % sources].sendto(what[number % len(what)], (HOST, port))
         sent = due
@@ -128,40 +129,46 @@ def flood(kind: str, options: argparse.Namespace) -> None:
         ground.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
         port, apart = _free_port(), _free_port() if options.apart else None
         pid = stack.enter_context(service(folder, port, ground.getsockname()[1], apart))
-        watched = Watched(pid)
         time.sleep(SETTLE_S)
+        watched, sent_file = Watched(pid), folder / "sent"
+        command = [sys.executable, __file__, "--strangers", kind, "--port", str(port)]
+        command += ["--rate", str(options.rate), "--sources", str(options.sources)]
+
+        def let_them_come() -> None:
+            output = stack.enter_context(sent_file.open("wb"))
+            flooding = stack.enter_context(subprocess.Popen(command, stdout=output))  # noqa: S603
+            stack.callback(flooding.kill)
+
+        def count() -> int:
+            numbers = sent_file.read_bytes().split() if sent_file.exists() else []
+            return int(numbers[-2]) if len(numbers) > 1 else 0  # the last one may be half written
+
+        if options.first:
+            let_them_come()
+            while not count():
+                time.sleep(TURN_S)
+            time.sleep(SETTLE_S)
+        before, before_s = count(), time.monotonic()
+        began, sent, answered, busy_s = time.monotonic(), 0, 0, watched.busy_s
         size = {"seed": 1, "sensors": SENSORS, "duration": 30.0}
-        seconds = SETTLE_S + options.seconds
-        feed = bursts(scenario("circle", **size), seconds)
-        flooding: subprocess.Popen[bytes] | None = None
-        began, sent, answered, busy_s = time.monotonic(), 0, 0, 0.0
-        first = options.first
-        for burst in feed:
+        for burst in bursts(scenario("circle", **size), SETTLE_S + options.seconds):
             passed_s = time.monotonic() - began
-            if flooding is None and (first or passed_s > SETTLE_S):
-                command = [sys.executable, __file__, "--strangers", kind, "--port", str(port)]
-                command += ["--rate", str(options.rate), "--sources", str(options.sources)]
-                output = (folder / "sent").open("wb")
-                flooding = stack.enter_context(subprocess.Popen(command, stdout=output))  # noqa: S603
-                stack.callback(flooding.kill)
-                busy_s = watched.busy_s
+            if not sent_file.exists() and passed_s > SETTLE_S:
+                before_s = time.monotonic()
+                let_them_come()
             answered += _answers(ground, burst.due_s - passed_s, sent > answered)
             for raw in burst.frames:
                 array.sendto(raw, (HOST, apart or port))
             sent += burst.stamp_ms is not None
         answered += _answers(ground, 0.5, True)
-        lasted_s = time.monotonic() - began - SETTLE_S
-        busy, memory_mb = (watched.busy_s - busy_s) / lasted_s, watched.memory_mb
-        came = int((folder / "sent").read_bytes().split()[-1]) if flooding else 0
+        lasted_s = time.monotonic() - began
+        busy = (watched.busy_s - busy_s) / lasted_s
+        came = (count() - before) / (time.monotonic() - before_s)
         lines = (folder / "log").read_bytes().count(b"\n")
         print(
-            f"{kind:9} {came / lasted_s:7.0f} datagrams/s  {answered}/{sent} epochs  "
-            f"{memory_mb:.0f} MB  {100 * busy:.0f} % busy  {lines} lines"
+            f"{kind:9} {came:7.0f} datagrams/s  {answered}/{sent} epochs answered  "
+            f"{watched.memory_mb:.0f} MB  {100 * busy:.0f} % busy  {lines} lines"
         )
-        if options.log:
-            os.kill(pid, signal.SIGTERM)
-            time.sleep(2)
-            print((folder / "log").read_text()[-1000:])
 
 
 def _answers(ground: socket.socket, wait_s: float, any_open: bool) -> int:
@@ -191,7 +198,6 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--first", action="store_true", help="strangers come before the array")
     parser.add_argument("--apart", action="store_true", help="the array has a port of its own")
-    parser.add_argument("--log", action="store_true", help="show the end of the service's log")
     parser.add_argument("--strangers", choices=KINDS, help=argparse.SUPPRESS)
     parser.add_argument("--port", type=int, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
