@@ -8,15 +8,20 @@ import subprocess
 import sys
 import tarfile
 import zipfile
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-NOT_IN_THE_WHEEL = ("risaf_link/core/native/", "risaf_link/mavlink/native/")
+NATIVE = ("risaf_link/core/native/", "risaf_link/mavlink/native/")
+KERNEL = "risaf_link/core/_kernel."
 
 
 def tracked() -> set[str]:
     """What is under version control."""
     command = ["git", "-c", "safe.directory=*", "ls-files", "-z"]
-    return set(subprocess.check_output(command, text=True).rstrip("\0").split("\0"))  # noqa: S603
+    try:
+        told = subprocess.check_output(command, text=True)  # noqa: S603
+    except (OSError, subprocess.CalledProcessError):
+        sys.exit("expected a clone of the repository, and git: else nobody knows what is stray")
+    return set(told.rstrip("\0").split("\0"))
 
 
 def of_sdist(path: Path) -> tuple[set[str], set[str]]:
@@ -27,16 +32,16 @@ def of_sdist(path: Path) -> tuple[set[str], set[str]]:
 
 
 def of_wheel(path: Path) -> tuple[set[str], set[str]]:
-    """What is in it, but for the metadata, and what should be."""
+    """What is in it, but for its metadata, and what should be."""
     with zipfile.ZipFile(path) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
-    kernel = {name for name in names if PurePosixPath(name).match("risaf_link/core/_kernel.*.so")}
+    kernel = {name for name in names if name.startswith(KERNEL) and name.endswith(".so")}
     expected = {
         f"risaf_link/{name}" if name.startswith("packaging/") else name
         for name in tracked()
-        if name.startswith(("risaf_link/", "packaging/")) and not name.startswith(NOT_IN_THE_WHEEL)
+        if name.startswith(("risaf_link/", "packaging/")) and not name.startswith(NATIVE)
     }
-    return names, expected | (kernel or {"risaf_link/core/_kernel.*.so"})
+    return names, expected | (kernel or {f"{KERNEL}*.so"})
 
 
 def main() -> None:
