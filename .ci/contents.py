@@ -12,15 +12,20 @@ from pathlib import Path
 
 NATIVE = ("risaf_link/core/native/", "risaf_link/mavlink/native/")
 KERNEL = "risaf_link/core/_kernel."
+BUILT = (".so", ".pyc")
+LEFT = {".git", ".venv", "__pycache__", "build", "dist", "out", "node_modules", ".hypothesis"}
+LEFT |= {".mypy_cache", ".pytest_cache", ".ruff_cache"}
 
 
 def tracked() -> set[str]:
-    """What is under version control."""
+    """What is under version control; where this is no clone: what is not left over from building."""
     command = ["git", "-c", "safe.directory=*", "ls-files", "-z"]
     try:
-        told = subprocess.check_output(command, text=True)  # noqa: S603
+        told = subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL)  # noqa: S603
     except (OSError, subprocess.CalledProcessError):
-        sys.exit("expected a clone of the repository, and git: else nobody knows what is stray")
+        print("no clone of the repository: what is there is taken for what should be")
+        there = (path for path in Path().rglob("*") if path.is_file())
+        return {str(p) for p in there if p.suffix not in BUILT and LEFT.isdisjoint(p.parts)}
     return set(told.rstrip("\0").split("\0"))
 
 
