@@ -18,7 +18,7 @@ LEFT |= {".mypy_cache", ".pytest_cache", ".ruff_cache"}
 
 
 def tracked() -> set[str]:
-    """What is under version control; where this is no clone: what is not left over from building."""
+    """What is under version control; where this is no clone, what nobody has built."""
     command = ["git", "-c", "safe.directory=*", "ls-files", "-z"]
     try:
         told = subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL)  # noqa: S603
