@@ -1,18 +1,33 @@
 """What is taken from a peer, and whether it shows that the peer belongs here."""
 
+import contextlib
+import logging
+import random
+import socket
+
 import pytest
 from network import FAR, GCS, NEAR
 from streams import KEY, seeded, unknown
-from test_service import Running, config_for, ground, until  # noqa: F401
+from test_service import (
+    EPOCHS,
+    Running,
+    address_of,
+    bursts,
+    config_for,
+    feed,
+    ground,  # noqa: F401
+    until,
+)
 from test_signing import link, signed
 from wire import AUTOPILOT, frame
 
 from risaf_link.gate import ORDERS_A_SECOND, ORDERS_AT_ONCE, Gate
 from risaf_link.keys import Keys
-from risaf_link.links import Worth
+from risaf_link.links import Worth, udp
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import Frame, FrameParser, FrameTable
 from risaf_link.mavlink.signing import LinkSigning, SigningKey
+from risaf_link.service import MOST_PEERS as MOST_PARSERS
 
 OWN = (1, 191)
 NOW_US = 1_800_000_000_000_000
@@ -93,3 +108,34 @@ async def test_a_stranger_is_answered_once_it_sends_a_frame(ground):  # noqa: F8
         assert not service.links[2].peers
         ground.transport.sendto(frame("HEARTBEAT").raw, ("127.0.0.1", port))
         await until(lambda: service.links[2].peers)
+
+
+async def test_strangers_who_flood_the_arrays_port_cost_no_epoch_and_little_memory(
+    ground,  # noqa: F811
+    caplog,
+):
+    caplog.set_level(logging.INFO, "risaf_link.links")
+    chance = random.Random(1)  # noqa: S311
+    flood = [chance.randbytes(size) for size in range(1, 280)]
+    flood += [frame("HEARTBEAT", (system, 190)).raw for system in range(2, 250)]
+    flood += [order(name).raw for name in ORDERS for _ in range(50)]
+    chance.shuffle(flood)
+    with contextlib.ExitStack() as stack:
+        strangers = [
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            for _ in range(100)
+        ]
+        async with Running(config_for(ground), up=2) as service:
+            heard = []
+            for number, burst in enumerate(bursts()):
+                for stranger in strangers if number > 2 else ():  # the array is there
+                    stranger.sendto(chance.choice(flood), address_of(service))
+                heard += await feed(ground, service, [burst])
+            array = service.links[0]
+            assert len(heard) == EPOCHS
+            assert service.pipeline.assembler.counts["samples_lost"] == 0
+            assert array.counts.dropped_in > 50 * EPOCHS
+            assert len(array.peers) <= udp.MOST_PEERS // 2
+            assert len(service._parsers) <= MOST_PARSERS
+    told = [line for line in caplog.messages if line.startswith("array: ")]
+    assert len(told) < 40
