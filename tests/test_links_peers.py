@@ -81,6 +81,34 @@ async def test_strangers_do_not_drive_out_the_udp_peers_that_are_there(
         assert [await receive_from(peer) for peer in peers] == [FRAME, FRAME]
 
 
+async def test_garbage_takes_no_place_of_a_silent_peer(
+    udp_socket: Callable[..., socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "MOST_PEERS", 2)  # one of one host
+    now_s = 1000.0
+    link = UdpInLink("ground", HOST, 0, now_s=lambda: now_s)
+    heard: list[bytes] = []
+
+    def receive(data: bytes, _: str) -> Worth:
+        heard.append(data)
+        return Worth.NOTHING if data == b"garbage" else Worth.FRAMES
+
+    task = asyncio.create_task(link.run(receive))
+    await until(lambda: link.counts.connections)
+    peer, stranger = udp_socket(), udp_socket()
+    peer.sendto(b"here", (HOST, port_of(link)))
+    await until(lambda: link.peers)
+    before = link.peers
+    now_s += 30.0
+    stranger.sendto(b"garbage", (HOST, port_of(link)))
+    await until(lambda: b"garbage" in heard)
+    assert link.peers == before
+    stranger.sendto(b"here", (HOST, port_of(link)))
+    await until(lambda: link.peers != before)
+    task.cancel()
+    await asyncio.wait([task])
+
+
 async def test_one_host_never_has_all_places(
     udp_socket: Callable[..., socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:

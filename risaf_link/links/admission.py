@@ -12,7 +12,6 @@ drive out those who are there.
 """
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from risaf_link.links.link import LinkCounts, Worth
@@ -91,10 +90,8 @@ class Strangers:
             _log.warning("%s: too much comes: %d not heard so far", self._name, count)
 
 
-def place_for(
-    host: str, guests: dict[str, Guest], most: int, now_s: float, forget: Callable[[str], None]
-) -> bool:
-    """Whether there is a place for one more; who was silent for long gives way for it.
+def who_gives_way(host: str, guests: dict[str, Guest], most: int, now_s: float) -> str | None:
+    """Who has to go if one more is to have a place; "": nobody; None: nobody will.
 
     Parameters
     ----------
@@ -106,16 +103,11 @@ def place_for(
         How many places there are.
     now_s : float
         Seconds, of a clock that does not jump.
-    forget : callable
-        Takes the name of who gives way.
     """
     rivals = [guest for guest in guests.values() if guest.host == host]
     if len(rivals) < max(1, most // 2):
         if len(guests) < most:
-            return True
+            return ""
         rivals = list(guests.values())
     silent = min(rivals, key=lambda guest: guest.heard_s)
-    if now_s - silent.heard_s < GIVES_WAY_S:
-        return False
-    forget(silent.name)
-    return True
+    return silent.name if now_s - silent.heard_s >= GIVES_WAY_S else None

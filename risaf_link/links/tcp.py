@@ -6,7 +6,7 @@ import socket
 import time
 from collections.abc import Callable
 
-from risaf_link.links.admission import Guest, Strangers, place_for
+from risaf_link.links.admission import Guest, Strangers, who_gives_way
 from risaf_link.links.endpoint import Endpoint, OnePeerLink, Stream, address_text
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link
 
@@ -116,11 +116,13 @@ class TcpInLink(Link):
         """Take a client in, if there is a place for it."""
         now_s = self._now_s()
         host, guests = client.host, {name: each.guest for name, each in self._clients.items()}
-        if not self._strangers.admits(host, now_s) or not place_for(
-            host, guests, MOST_CLIENTS, now_s, lambda name: self._clients[name].give_way()
-        ):
+        admitted = self._strangers.admits(host, now_s)
+        yielding = who_gives_way(host, guests, MOST_CLIENTS, now_s) if admitted else None
+        if yielding is None:
             self._strangers.refuse(now_s)
             return False
+        if yielding:
+            self._clients[yielding].give_way()
         client.guest = Guest(client.peer, host, now_s)
         self._clients[client.peer] = client
         _log.info("%s: peer %s: new", self.name, client.peer)

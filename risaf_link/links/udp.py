@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from risaf_link.links.admission import FRAME_BYTES, Guest, Strangers, place_for
+from risaf_link.links.admission import FRAME_BYTES, Guest, Strangers, who_gives_way
 from risaf_link.links.endpoint import Address, Endpoint, OnePeerLink, address_text
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link, Worth
 
@@ -185,7 +185,8 @@ class UdpInLink(Link):
         """Take a stranger's datagram; if it was worth it, the stranger is a peer."""
         host = address[0]
         admitted = self._strangers.admits(host, now_s)
-        if not admitted or not place_for(host, self._guests, MOST_PEERS, now_s, self._forget):
+        yielding = who_gives_way(host, self._guests, MOST_PEERS, now_s) if admitted else None
+        if yielding is None:
             self._strangers.refuse(now_s)
             return
         name = address_text(address)
@@ -194,6 +195,8 @@ class UdpInLink(Link):
         if worth not in {Worth.FRAMES, Worth.SAMPLES}:
             del self._addresses[name]
             return
+        if yielding in self._guests:
+            self._forget(yielding)
         self._known[address] = self._guests[name] = guest = Guest(name, host, now_s)
         guest.note(worth, now_s)
         _log.info("%s: peer %s: new", self.name, name)
