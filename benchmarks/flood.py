@@ -8,6 +8,7 @@ service took; its time on a processor; the lines that it logged. Three processes
 """
 
 import argparse
+import math
 import os
 import random
 import select
@@ -64,9 +65,11 @@ def _datagram(kind: str, chance: random.Random) -> bytes:
 
 
 def strangers(kind: str, port: int, rate: float, sources: int) -> None:
-    """Send to a port until killed."""
+    """Send to a port, from when a line comes until killed."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(sources)]
     what = datagrams(kind, 997)
+    print(0, flush=True)
+    sys.stdin.readline()
     began, sent = time.monotonic(), 0
     while True:
         due = min(int((time.monotonic() - began) * rate), sent + MOST_A_TURN)
@@ -134,28 +137,30 @@ def flood(kind: str, options: argparse.Namespace) -> None:
         command = [sys.executable, __file__, "--strangers", kind, "--port", str(port)]
         command += ["--rate", str(options.rate), "--sources", str(options.sources)]
 
-        def let_them_come() -> None:
-            output = stack.enter_context(sent_file.open("wb"))
-            flooding = stack.enter_context(subprocess.Popen(command, stdout=output))  # noqa: S603
-            stack.callback(flooding.kill)
+        output = stack.enter_context(sent_file.open("wb"))
+        flooding = stack.enter_context(
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output)  # noqa: S603
+        )
+        stack.callback(flooding.kill)
+        while not sent_file.stat().st_size:
+            time.sleep(TURN_S)
+        before_s = math.inf  # the flood
 
-        def count() -> int:
-            numbers = sent_file.read_bytes().split() if sent_file.exists() else []
-            return int(numbers[-2]) if len(numbers) > 1 else 0  # the last one may be half written
+        def let_them_come() -> float:
+            assert flooding.stdin  # noqa: S101 it is a pipe
+            flooding.stdin.write(b"\n")
+            flooding.stdin.flush()
+            return time.monotonic()
 
         if options.first:
-            let_them_come()
-            while not count():
-                time.sleep(TURN_S)
+            before_s = let_them_come()
             time.sleep(SETTLE_S)
-        before, before_s = count(), time.monotonic()
         began, sent, answered, busy_s = time.monotonic(), 0, 0, watched.busy_s
         size = {"seed": 1, "sensors": SENSORS, "duration": 30.0}
         for burst in bursts(scenario("circle", **size), SETTLE_S + options.seconds):
             passed_s = time.monotonic() - began
-            if not sent_file.exists() and passed_s > SETTLE_S:
-                before_s = time.monotonic()
-                let_them_come()
+            if before_s == math.inf and passed_s > SETTLE_S:
+                before_s = let_them_come()
             answered += _answers(ground, burst.due_s - passed_s, sent > answered)
             for raw in burst.frames:
                 array.sendto(raw, (HOST, apart or port))
@@ -163,7 +168,8 @@ def flood(kind: str, options: argparse.Namespace) -> None:
         answered += _answers(ground, 0.5, True)
         lasted_s = time.monotonic() - began
         busy = (watched.busy_s - busy_s) / lasted_s
-        came = (count() - before) / (time.monotonic() - before_s)
+        numbers = sent_file.read_bytes().split()[:-1]  # the last one may be half written
+        came = int(numbers[-1]) / (time.monotonic() - before_s)
         lines = (folder / "log").read_bytes().count(b"\n")
         print(
             f"{kind:9} {came:7.0f} datagrams/s  {answered}/{sent} epochs answered  "
