@@ -5,7 +5,7 @@ together, and what is wrong with them is said.
 """
 
 import re
-from collections.abc import Hashable, Iterable
+from collections.abc import Iterable
 from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ from msgspec import Meta, Struct, field, inspect
 
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.tunable import Tunable
+from risaf_link.document import DocumentError, parse_document, read_document
 from risaf_link.errors import ConfigError, LinkError
 from risaf_link.links import RecordingParameters, TlogLink, open_link, overlap
 from risaf_link.mavlink.dialect import IDS
@@ -203,6 +204,10 @@ def _check_feeding(where: str, config: Config) -> None:
 def _check_signing(where: str, link: LinkParameters) -> None:
     if link.url.startswith("tlog:"):
         raise ConfigError(f"{where}: found it of a recording, expected it of a link with peers")
+    if link.signing and re.fullmatch(r"[0-9A-Fa-f]{64}", link.signing.key):  # not to be repeated
+        raise ConfigError(
+            f"{where}.key: found 64 hexadecimal digits, expected the name of a file with them"
+        )
     named = link.signing.accept_unsigned if link.signing else ()
     for k, name in enumerate(() if isinstance(named, bool) else named):
         if name not in IDS:
@@ -211,27 +216,13 @@ def _check_signing(where: str, link: LinkParameters) -> None:
             )
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that stands twice in the same place; YAML would take the last one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                line = node.value[i][0].start_mark.line + 1
-                raise yaml.YAMLError(f"line {line}: {key}: found twice, expected once")
-        return super().construct_mapping(node, deep)
-
-
 def _read_yaml(path: Path) -> Any:
     try:
-        return yaml.load(path.read_text(), _StrictLoader)  # noqa: S506 it is a SafeLoader
+        return read_document(path)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: found bytes that are not UTF-8, expected YAML") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
+    except DocumentError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def _set(tree: dict[str, Any], setting: str) -> None:
@@ -240,8 +231,8 @@ def _set(tree: dict[str, Any], setting: str) -> None:
     if not equals or not path:
         raise ConfigError(f"--set {setting}: expected KEY=VALUE")
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
+        value = parse_document(text)
+    except DocumentError:
         raise ConfigError(f"--set {path}: found {text!r}, expected a YAML value") from None
     *parents, key = path.split(".")
     place: Any = tree

@@ -13,6 +13,7 @@ import yaml
 from msgspec import structs
 
 from risaf_link.config import Config, StateParameters, load
+from risaf_link.document import DocumentError, read_document
 from risaf_link.mavlink.parameters import Parameters, parameters_of
 from risaf_link.whole import replace_file
 
@@ -117,10 +118,10 @@ def _place(config: Config, config_path: Path | None) -> Path | None:
 
 def _read(path: Path) -> dict[Any, Any]:
     try:
-        found = yaml.safe_load(path.read_text())
+        found = read_document(path)
     except FileNotFoundError:
         return {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, DocumentError) as error:
         _log.warning("%s: %s; left out", path, " ".join(str(error).split()))
         return {}
     if not isinstance(found, dict | None):

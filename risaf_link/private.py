@@ -7,6 +7,7 @@ from pathlib import Path
 from risaf_link.errors import ConfigError
 
 OTHERS = stat.S_IRWXG | stat.S_IRWXO
+LARGEST = 65536  # bytes; the largest secret, a key in PEM, has some thousand
 
 
 def read_private(path: Path, where: str) -> bytes | None:
@@ -37,7 +38,10 @@ def read_private(path: Path, where: str) -> bytes | None:
                     f"{where}found {path.name} owned by user {status.st_uid}, "
                     f"expected {os.geteuid()}, who runs this"
                 )
-            return file.read()
+            content = file.read(LARGEST + 1)
+            if len(content) > LARGEST:
+                raise ConfigError(f"{where}found more than {LARGEST} bytes, expected a secret")
+            return content
     except FileNotFoundError:
         return None
     except OSError as error:

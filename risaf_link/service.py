@@ -14,9 +14,10 @@ from risaf_link.config import Config, identity_of, load_calibration
 from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.kernel import BUILT
+from risaf_link.gate import Gate
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.keys import open_keys
-from risaf_link.links import Link, TlogLink, open_link
+from risaf_link.links import Link, TlogLink, Worth, open_link
 from risaf_link.loop import unix_us
 from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.commands import Peer
@@ -88,6 +89,7 @@ class Service:
         self._kept = kept
         self._storing: set[asyncio.Task[None]] = set()
         self._keys = open_keys(config)
+        self._gate = Gate(self._keys, lambda: self.pipeline.ingest.own)
         self._component = Component(
             parameters,
             self.pipeline,
@@ -165,29 +167,30 @@ class Service:
             counts = self.pipeline.assembler.counts
             _log.info("ended: %d frames, %d epochs", self._frames, counts["epochs"])
 
-    def _receive(self, link: Link, data: bytes, peer: str) -> None:
-        """Take what came over a link, and send what comes of it."""
+    def _receive(self, link: Link, data: bytes, peer: str) -> Worth:
+        """Take what came over a link, and send what comes of it; tell what it was worth."""
         sender = link.name, peer
         if sender != self._holding:
             self._take_held()
             self._holding = sender
-        if not self._held.holds(data):
-            self._take(self._held.take(data), sender)
-            self._held.note_end(data, self._blocks.is_steady)
+        if self._held.holds(data):
+            return Worth.UNKNOWN
+        worth = self._take(self._held.take(data), sender)
+        self._held.note_end(data, self._blocks.is_steady)
+        return worth
 
     def _take_held(self) -> None:
         """Take what waits, if anything does."""
         if self._held:
             self._take(self._held.take(), self._holding)
 
-    def _take(self, data: bytes, sender: Peer) -> None:
+    def _take(self, data: bytes, sender: Peer) -> Worth:
+        before_us = self.pipeline.ingest.heard_us
         self._began_ns = time.perf_counter_ns()
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
         self._keys.advance(received_us)
-        table = self._parser(*sender).receive_table(data)
-        signing = self._keys.links.get(sender[0])
-        if signing:
-            table = signing.taken(table)
+        cut = self._parser(*sender).receive_table(data)
+        table = self._gate.admitted(cut, sender, received_us)
         self._frames += len(table)
         self._frames_in[sender[0]] += len(table)
         self._record(table, received_us)
@@ -203,6 +206,9 @@ class Service:
         self._hand_out(self._component.collect(self._peers()))
         self._tell_mismatch()
         self._tell_recalled()
+        if self.pipeline.ingest.heard_us != before_us:
+            return Worth.SAMPLES
+        return self._gate.worth(table, sender[0])
 
     def _record(self, table: FrameTable, received_us: int) -> None:
         """Record what was taken, but for keys."""
@@ -269,13 +275,14 @@ class Service:
             dropped=self.dropped,
             rejected=self.rejected,
             assembly=self.pipeline.assembler.counts,
-            unused=self.pipeline.ingest.counts,
+            unused=self.pipeline.ingest.counts + self._gate.refused,
             links=[
                 Traffic(
                     link.name,
                     *(link.counts.bytes_in, link.counts.bytes_out),
                     *(self._frames_in[link.name], self._frames_out[link.name]),
                     *(link.counts.dropped_out, link.counts.connections, len(link.peers)),
+                    link.counts.dropped_in,
                 )
                 for link in self.links
             ],

@@ -22,7 +22,7 @@ from risaf_link.core.heading import HeadingState
 from risaf_link.core.health import SensorState
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import FrameParser
-from risaf_link.mavlink.peers import Terms
+from risaf_link.mavlink.peers import MOST_PEERS, Terms
 from risaf_link.pipeline import Pipeline
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = range(6)
@@ -162,6 +162,23 @@ class TestIntervals:
     def test_what_cannot_be_is_denied(self, network, message, interval):
         assert acks(network.command(SET, message, interval)) == [(SET, DENIED)]
         assert self.rate(network, NEAR) == 50
+
+    def test_one_peer_gets_no_more_than_two_thousand_messages_a_second(self, network):
+        asked = [(QUATERNION, 1), (59615, 2000), (59616, 1000)]  # 1 us is taken for a millisecond
+        results = [acks(network.command(SET, *one))[0][1] for one in asked]
+        assert results == [ACCEPTED, ACCEPTED, DENIED]
+        assert network.command(GET, QUATERNION)[0].interval_us == 1000
+        assert acks(network.command(SET, QUATERNION, 2000)) == [(SET, ACCEPTED)]
+        assert acks(network.command(SET, 59616, 1000)) == [(SET, ACCEPTED)]
+        assert acks(network.command(SET, QUATERNION, 1e6, peer=FAR)) == [(SET, ACCEPTED)]
+
+    def test_who_is_served_is_not_forgotten_for_those_who_come_and_go(self, network):
+        network.command(SET, QUATERNION, 1e6 / 20)
+        for port in range(2 * MOST_PEERS):
+            network.peers = [NEAR, ("ground", f"10.9.9.9:{port}")]
+            network.estimate(at(50 + port / 1000))
+        network.peers = [NEAR]
+        assert self.rate(network, NEAR) == 20
 
     def test_they_can_be_read_in_both_ways(self, network):
         network.command(SET, QUATERNION, 40_000)

@@ -22,7 +22,7 @@ from wire import frame
 
 from risaf_link.config import Config, dump, load
 from risaf_link.errors import ConfigError
-from risaf_link.keys import open_keys
+from risaf_link.keys import KeyFile, open_keys
 from risaf_link.mavlink.frame import encode
 from risaf_link.mavlink.signing import (
     RESERVE,
@@ -30,6 +30,7 @@ from risaf_link.mavlink.signing import (
     SigningKey,
     SigningParameters,
     SigningState,
+    setup_in,
 )
 from risaf_link.mavlink.tlog import TlogReader
 from risaf_link.service import Service
@@ -70,6 +71,25 @@ def test_a_key_that_others_may_read_is_refused(tmp_path, mode):
         f"links.0.signing.key: {path}: found signing.key with mode {mode:04o}, "
         "expected 0600 or 0400: readable by its owner alone"
     )
+
+
+def test_a_file_that_is_no_key_is_not_read_to_its_end(tmp_path):
+    path = key_file(tmp_path)
+    os.truncate(path, 10**9)
+    with pytest.raises(ConfigError, match="found more than 65536 bytes, expected a secret"):
+        open_keys(config(path))
+
+
+def test_nothing_that_is_printed_shows_a_secret(tmp_path):
+    key = SigningKey(KEY)
+    offered = setup_in(frame("SETUP_SIGNING", (255, 190), **setup(OTHER_KEY)))
+    key.replace(offered.secret, offered.ticks)
+    file = KeyFile(tmp_path / "signing.key", key)
+    for shown in (key, key.snapshot(), offered, file, open_keys(config(key_file(tmp_path)))):
+        for text in (repr(shown), str(shown)):
+            for secret in (KEY, OTHER_KEY):
+                assert secret.hex() not in text
+                assert repr(secret)[2:-1] not in text
 
 
 def test_a_key_that_belongs_to_another_is_refused(tmp_path, monkeypatch):

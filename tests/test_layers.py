@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "risaf_link"
 LAYERS = [
-    {"errors"},
+    {"errors", "document"},
     {"private", "parent", "address", "whole", "loop"},
     {"core"},
     {"mavlink"},
@@ -16,6 +16,7 @@ LAYERS = [
     {"config", "sweep"},
     {"kept"},
     {"keys", "remembered", "supervisor", "install"},
+    {"gate"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench", "demo"},
     {"judgement"},

@@ -20,6 +20,7 @@ from risaf_link.links import (
     TcpOutLink,
     UdpInLink,
     UdpOutLink,
+    Worth,
 )
 from risaf_link.links.link import Backoff
 
@@ -34,8 +35,9 @@ FRAME = b"\xfd\x09\x00\x00\x00\x01\x01" + bytes(range(20))
 class Inbox(list[tuple[bytes, str]]):
     """What a link received, piece by piece."""
 
-    def __call__(self, data: bytes, peer: str) -> None:
+    def __call__(self, data: bytes, peer: str) -> Worth:
         self.append((data, peer))
+        return Worth.FRAMES
 
     @property
     def stream(self) -> bytes:

@@ -15,6 +15,7 @@ from msgspec import structs
 from prometheus_client.parser import text_string_to_metric_families
 
 from risaf_link.errors import ConfigError
+from risaf_link.mavlink.allowance import Allowance
 from risaf_link.publish import scrape
 from risaf_link.publish.account import Account, MqttCounts
 from risaf_link.publish.metrics import BOUNDS_US, Metrics
@@ -28,7 +29,9 @@ def metered(ground, **sections):
     return structs.replace(config_for(ground), metrics=ANYWHERE, **sections)
 
 
-async def ask(port: int, request: bytes = b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n") -> bytes:
+async def ask(
+    port: int, request: bytes = b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n"
+) -> bytes:
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     try:
         writer.write(request)
@@ -170,6 +173,8 @@ async def test_who_takes_too_long_is_left(monkeypatch):
         (b"GET /metrics?name=x HTTP/1.0\r\n\r\n", b"200 OK"),
         (b"HEAD /metrics HTTP/1.1\r\n\r\n", b"200 OK"),
         (b"\x16\x03\x01\r\n\r\n", b"405 Method Not Allowed"),
+        (b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:9100\r\n\r\n", b"200 OK"),
+        (b"GET /metrics HTTP/1.1\r\nhOST: rebound.example\r\n\r\n", b"403 Forbidden"),
     ],
 )
 async def test_it_is_read_and_nothing_else(request_, status):
@@ -182,6 +187,17 @@ async def test_it_is_read_and_nothing_else(request_, status):
     assert answer.split(b"\r\n")[0] == b"HTTP/1.1 " + status
     if request_.startswith(b"HEAD"):
         assert answer.endswith(b"\r\n\r\n")
+
+
+async def test_who_asks_all_the_time_is_told_to_ask_less_often():
+    metrics = Metrics(ANYWHERE, lambda: Account({}, {}, {}, {}, []))
+    task = asyncio.create_task(metrics.run())
+    await until(lambda: metrics.page.port)
+    metrics.page._allowance = Allowance(rate=0.001, most=2)
+    answers = [(await ask(metrics.page.port)).split(b"\r\n")[0] for _ in range(3)]
+    task.cancel()
+    await asyncio.wait([task])
+    assert answers == [*[b"HTTP/1.1 200 OK"] * 2, b"HTTP/1.1 429 Too Many Requests"]
 
 
 async def test_a_port_that_is_taken_is_told_once_and_the_service_goes_on(

@@ -23,6 +23,7 @@ from risaf_link.mavlink.dialect import IDS, pack
 from risaf_link.mavlink.frame import FrameParser, encode
 from risaf_link.mavlink.signing import LinkSigning, SigningKey, SigningParameters
 from risaf_link.mavlink.tlog import TlogReader, record
+from risaf_link.monitor import server
 from risaf_link.monitor.recording import FASTEST, Player, Recording, open_recording
 from risaf_link.monitor.server import application, serve
 from risaf_link.monitor.source import Live, Log
@@ -273,12 +274,64 @@ async def test_nothing_can_be_done_to_what_is_live():
         assert (await client.get("/")).status == 200
 
 
-async def test_another_name_for_this_machine_is_refused(recording):
+@pytest.mark.parametrize(
+    ("listening", "asked", "status"),
+    [
+        ("127.0.0.1", "evil.example", 403),
+        ("127.0.0.1", "evil.example:8765", 403),
+        ("127.0.0.1", "evil.local", 403),
+        ("127.0.0.1", "127.0.0.1.evil.example", 403),
+        ("127.0.0.1", "localhost:8765", 200),
+        ("127.0.0.1", "[::1]:8765", 200),
+        ("0.0.0.0", "evil.example:8765", 403),  # noqa: S104
+        ("0.0.0.0", "10.0.0.7:8765", 200),  # noqa: S104
+        ("0.0.0.0", "boat.local", 200),  # noqa: S104
+        ("boat.fleet.example", "boat.fleet.example:8765", 200),
+        ("boat.fleet.example", "[evil]:x", 403),
+    ],
+)
+async def test_a_name_that_another_site_can_give_us_is_refused(recording, listening, asked, status):
+    async with browsing(Log("drive.tlog", Player(recording)), listening) as client:
+        for path in ("/", "/page/page.js", "/updates"):
+            response = await client.get(path, headers={"Host": asked})
+            assert response.status == status
+            response.close()
+
+
+async def test_another_sites_page_may_neither_read_nor_say_anything(recording):
+    player = Player(recording)
+    other = {"Origin": "https://evil.example"}
+    async with browsing(Log("drive.tlog", player)) as client:
+        asking = {**other, "Access-Control-Request-Method": "POST"}
+        asking["Access-Control-Request-Headers"] = "content-type"
+        for answer in (
+            await client.options("/play", headers=asking),
+            await client.get("/updates", headers=other),
+        ):
+            assert not [name for name in answer.headers if name.startswith("Access-Control")]
+            answer.close()
+        assert (await client.options("/play", headers=asking)).status == 405
+
+
+async def test_so_many_pages_are_open_and_no_more(recording, monkeypatch):
+    monkeypatch.setattr(server, "MOST_PAGES", 2)
     async with browsing(Log("drive.tlog", Player(recording))) as client:
-        assert (await client.get("/", headers={"Host": "evil.example"})).status == 403
-        assert (await client.get("/", headers={"Host": "localhost:8765"})).status == 200
-    async with browsing(Log("drive.tlog", Player(recording)), host="10.0.0.7") as client:
-        assert (await client.get("/", headers={"Host": "boat.local"})).status == 200
+        streams = [await client.get("/updates") for _ in range(2)]
+        assert (await client.get("/updates")).status == 503
+        streams[0].close()
+        async with asyncio.timeout(SAFETY_S):
+            while (again := await client.get("/updates")).status == 503:
+                await asyncio.sleep(0.01)
+        again.close()
+        streams[1].close()
+
+
+async def test_a_wish_is_short(recording):
+    async with browsing(Log("drive.tlog", Player(recording))) as client:
+        wish = {"speed": 1, "is_paused": True, "seek_us": 1}
+        long = json.dumps(wish) + " " * server.LARGEST_WISH
+        headers = {"Content-Type": "application/json"}
+        assert (await client.post("/play", data=long, headers=headers)).status == 413
 
 
 async def test_a_page_on_ipv6_tells_a_url_that_a_browser_takes(recording):

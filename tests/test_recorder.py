@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import stat
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -70,6 +71,19 @@ Make = Callable[..., Bench]
 
 
 # Segments
+
+
+def test_others_on_the_computer_cannot_read_where_a_vehicle_was(
+    bench: Callable[..., Bench],
+) -> None:
+    one = bench()
+    before = os.umask(0)
+    try:
+        one.write(1, 2, 3, 4)
+    finally:
+        os.umask(before)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in one.folder.iterdir()}
+    assert modes == {"drive.tlog": 0o640, "drive.1.tlog": 0o640}
 
 
 def test_a_segment_that_is_full_is_followed_by_the_next(bench: Make) -> None:

@@ -123,7 +123,7 @@ async def test_a_client_that_does_not_read_costs_only_itself(ground):
         host, _, number = service.links[2].address.partition(":")
         slow = socket.create_connection((host, int(number)))
         await until(lambda: service.links[2].peers)
-        (client,) = service.links[2]._clients
+        (client,) = service.links[2]._clients.values()
         client.pause_writing()  # its buffer is full, as after some seconds of silence
         before = service.links[1].counts.dropped_out
         assert len(await feed(ground, service, bursts())) == EPOCHS

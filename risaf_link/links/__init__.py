@@ -6,7 +6,7 @@ from pathlib import Path
 
 from risaf_link.address import HOST
 from risaf_link.errors import LinkError
-from risaf_link.links.link import Link, LinkCounts, Receive
+from risaf_link.links.link import Link, LinkCounts, Receive, Worth
 from risaf_link.links.memory import MemoryLink
 from risaf_link.links.serial import SerialLink
 from risaf_link.links.tcp import TcpInLink, TcpOutLink
@@ -25,6 +25,7 @@ __all__ = [
     "TlogLink",
     "UdpInLink",
     "UdpOutLink",
+    "Worth",
     "open_link",
     "overlap",
 ]

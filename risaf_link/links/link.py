@@ -6,8 +6,19 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 
-Receive = Callable[[bytes, str], None]
+
+class Worth(Enum):
+    """What came of bytes that were received: that is how much more of the kind is heard."""
+
+    UNKNOWN = auto()  # they wait for others
+    NOTHING = auto()
+    FRAMES = auto()  # at least one was taken
+    SAMPLES = auto()  # of the array that is listened to
+
+
+Receive = Callable[[bytes, str], Worth]
 """Takes the bytes and who sent them: a peer such as ``127.0.0.1:14550``, "" where there is one."""
 
 _log = logging.getLogger(__name__)
@@ -20,6 +31,7 @@ class LinkCounts:
     bytes_in: int = 0
     bytes_out: int = 0  # handed to the system, once for each peer
     dropped_out: int = 0  # frames that a peer did not get, or that nobody was there for
+    dropped_in: int = 0  # datagrams and connections of those who want too much
     connections: int = 0  # how often the link came up
 
 
@@ -52,16 +64,17 @@ class Connection:
         self.counts.connections += 1
         _log.info("%s: up: %s", self.name, where)
 
-    def deliver(self, data: bytes, peer: str) -> None:
-        """Hand on what a peer sent."""
+    def deliver(self, data: bytes, peer: str) -> Worth:
+        """Hand on what a peer sent; tell what came of it."""
         if self.lost.done():
-            return
+            return Worth.NOTHING
         self.counts.bytes_in += len(data)
         try:
-            self._receive(data, peer)
+            return self._receive(data, peer)
         except Exception as error:
             self.failure = error
             self.end(ConnectionAbortedError("what was received could not be processed"))
+            return Worth.NOTHING
 
     def end(self, error: Exception) -> None:
         """Give the connection up; the first reason counts."""

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Iterable
 
-from risaf_link.links.link import Link
+from risaf_link.links.link import Link, Worth
 
 POLL_S = 0.01
 LINGER_S = 0.2  # for what the link's buffer still holds at the end
@@ -22,7 +22,7 @@ async def play(frames: Iterable[tuple[int, bytes]], link: Link) -> None:
         It is run here.
     """
     async with asyncio.TaskGroup() as tasks:
-        running = tasks.create_task(link.run(lambda _data, _peer: None))
+        running = tasks.create_task(link.run(lambda _data, _peer: Worth.NOTHING))
         while not link.counts.connections:  # noqa: ASYNC110 a link tells only by its counts
             await asyncio.sleep(POLL_S)
         await _send(frames, link)

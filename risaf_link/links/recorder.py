@@ -33,6 +33,7 @@ MOST_WAITING = 32 << 20  # bytes in memory: 15 s of 300 sensors at 1 kHz, 5 min 
 MOST_UNSYNCED = 4 << 20  # bytes that may have to be written again
 MOST_AT_ONCE = 1 << 20  # bytes
 SHARE_OF_ALL = 4  # segments that `most_bytes` holds at least
+MODE = 0o640  # where a vehicle was is not for everybody on the computer
 
 Message = tuple[bytes, int]  # whole records, and how many
 Numbered = tuple[int, Message]
@@ -182,7 +183,7 @@ class Recording:
             path = os.path.join(self._directory, f"{self._stem}{infix}{self._suffix}")
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
             with suppress(FileExistsError):  # somebody was faster
-                file = os.open(path, flags, 0o666)
+                file = os.open(path, flags, MODE)
         self._file, self.path, self._number = file, path, number
         self._size = self._synced_size = 0
         self._until_s = self._clock_s() + self._segment_s

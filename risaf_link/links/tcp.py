@@ -3,7 +3,10 @@
 import asyncio
 import logging
 import socket
+import time
+from collections.abc import Callable
 
+from risaf_link.links.admission import Guest, Strangers, who_gives_way
 from risaf_link.links.endpoint import Endpoint, OnePeerLink, Stream, address_text
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link
 
@@ -68,6 +71,8 @@ class TcpInLink(Link):
         Where it listens; with port 0 the system chooses one.
     backoff : Backoff
         How long it waits before it listens again.
+    now_s : Callable
+        A clock, seconds, that never jumps.
 
     Attributes
     ----------
@@ -75,17 +80,26 @@ class TcpInLink(Link):
         Where it listens in fact, once it does.
     """
 
-    def __init__(self, name: str, host: str, port: int, backoff: Backoff = BACKOFF) -> None:
+    def __init__(
+        self,
+        name: str,
+        host: str,
+        port: int,
+        backoff: Backoff = BACKOFF,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         super().__init__(name, backoff)
         self.address = address_text((host, port))
         self._host = host
         self._port = port
-        self._clients: set[_Client] = set()
+        self._clients: dict[str, _Client] = {}
+        self._now_s = now_s
+        self._strangers = Strangers(name, self.counts)
 
     async def _hold(self, connection: Connection) -> None:
         # Started apart: asyncio leaves the socket open if it is cancelled while it does both.
         server = await asyncio.get_running_loop().create_server(
-            lambda: _Client(connection, self._clients), self._host, self._port, start_serving=False
+            lambda: _Client(connection, self), self._host, self._port, start_serving=False
         )
         try:
             await server.start_serving()
@@ -94,52 +108,94 @@ class TcpInLink(Link):
             await connection.lost
         finally:
             server.close()
-            for client in list(self._clients):
+            for client in list(self._clients.values()):
                 await client.close()
             await server.wait_closed()
+
+    def enter(self, client: "_Client") -> bool:
+        """Take a client in, if there is a place for it."""
+        now_s = self._now_s()
+        host, guests = client.host, {name: each.guest for name, each in self._clients.items()}
+        admitted = self._strangers.admits(host, now_s)
+        yielding = who_gives_way(host, guests, MOST_CLIENTS, now_s) if admitted else None
+        if yielding is None:
+            self._strangers.refuse(now_s)
+            return False
+        if yielding:
+            self._clients[yielding].give_way()
+        client.guest = Guest(client.peer, host, now_s)
+        self._clients[client.peer] = client
+        _log.info("%s: peer %s: new", self.name, client.peer)
+        return True
+
+    def leave(self, client: "_Client", reason: object) -> None:
+        """Take note that a client has gone."""
+        if self._clients.get(client.peer) is client:
+            del self._clients[client.peer]
+            _log.info("%s: peer %s: gone: %s", self.name, client.peer, reason)
+
+    def hear(self, client: "_Client", data: bytes, connection: Connection) -> float:
+        """Hand on what a client sent; seconds until it may send more."""
+        now_s, guest = self._now_s(), client.guest
+        guest.note(connection.deliver(data, client.peer), now_s)
+        return 0.0 if guest.feeds(now_s) else guest.allowance.charge(len(data), now_s)
 
     def send(self, data: bytes) -> None:
         """Hand one frame to every client; without any it is dropped."""
         if not self._clients:
             self.counts.dropped_out += 1
-        for client in self._clients:
+        for client in self._clients.values():
             client.send(data)
 
     @property
     def peers(self) -> list[str]:
         """The clients."""
-        return [client.peer for client in self._clients]
+        return list(self._clients)
 
     def send_to(self, data: bytes, peer: str) -> None:
         """Hand one frame to one client; if it has gone the frame is dropped."""
-        for client in self._clients:
-            if client.peer == peer:
-                client.send(data)
-                return
-        self.counts.dropped_out += 1
+        client = self._clients.get(peer)
+        if client is None:
+            self.counts.dropped_out += 1
+        else:
+            client.send(data)
 
 
 class _Client(_TcpStream):
     """One client of several: its loss does not end the link's connection."""
 
-    def __init__(self, connection: Connection, clients: "set[_Client]") -> None:
+    guest: Guest  # once it is taken in
+
+    def __init__(self, connection: Connection, link: TcpInLink) -> None:
         super().__init__(connection)
-        self._clients = clients
+        self._link = link
+        self.host = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        if len(self._clients) == MOST_CLIENTS or self._connection.lost.done():
+        address = transport.get_extra_info("peername")
+        if not address or self._connection.lost.done():  # it has gone already, or we have
             self._transport.abort()
             return
-        self.peer = address_text(transport.get_extra_info("peername"))
-        self._clients.add(self)
-        _log.info("%s: peer %s: new", self._connection.name, self.peer)
-        if len(self._clients) == MOST_CLIENTS:
-            _log.warning("%s: no more than %d peers", self._connection.name, MOST_CLIENTS)
+        self.peer, self.host = address_text(address), address[0]
+        if not self._link.enter(self):
+            self._transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        wait_s = self._link.hear(self, data, self._connection)
+        if wait_s and not self._transport.is_closing():
+            self._transport.pause_reading()
+            asyncio.get_running_loop().call_later(wait_s, self._go_on)
+
+    def _go_on(self) -> None:
+        if not self._transport.is_closing():
+            self._transport.resume_reading()
+
+    def give_way(self) -> None:
+        """Be closed for another one."""
+        self._link.leave(self, "silent, and others want its place")
+        self._transport.abort()
 
     def connection_lost(self, error: Exception | None) -> None:
         self._closed.set()
-        if self in self._clients:
-            self._clients.remove(self)
-            reason = error or "closed by it"
-            _log.info("%s: peer %s: gone: %s", self._connection.name, self.peer, reason)
+        self._link.leave(self, error or "closed by it")

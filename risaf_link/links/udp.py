@@ -7,9 +7,11 @@ import os
 import socket
 import time
 from collections.abc import Callable
+from functools import partial
 
+from risaf_link.links.admission import FRAME_BYTES, Guest, Strangers, who_gives_way
 from risaf_link.links.endpoint import Address, Endpoint, OnePeerLink, address_text
-from risaf_link.links.link import BACKOFF, Backoff, Connection, Link
+from risaf_link.links.link import BACKOFF, Backoff, Connection, Link, Worth
 
 MOST_PEERS = 32
 SILENCE_S = 60.0  # after which a peer is forgotten
@@ -33,13 +35,13 @@ class _Datagrams(Endpoint, asyncio.DatagramProtocol):
     ----------
     connection : Connection
         What the socket belongs to.
-    heard : Callable
-        Told that an address spoke; says which peer that is.
+    hear : Callable
+        Takes a datagram, and the address that it came from.
     """
 
-    def __init__(self, connection: Connection, heard: Callable[[Address], str]) -> None:
+    def __init__(self, connection: Connection, hear: Callable[[bytes, Address], object]) -> None:
         super().__init__(connection)
-        self._heard = heard
+        self._hear = hear
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -58,7 +60,7 @@ class _Datagrams(Endpoint, asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, address: Address) -> None:
         """Take a datagram, and those that have come behind it: the loop would give one a turn."""
-        self._deliver(data, address)
+        self._take(data, address)
         for _ in range(MOST_AT_ONCE):
             try:
                 data, address = self._socket.recvfrom(LARGEST)
@@ -67,11 +69,11 @@ class _Datagrams(Endpoint, asyncio.DatagramProtocol):
             except OSError as error:
                 self.error_received(error)
                 return
-            self._deliver(data, address)
+            self._take(data, address)
 
-    def _deliver(self, data: bytes, address: Address) -> None:
+    def _take(self, data: bytes, address: Address) -> None:
         if data:
-            self._connection.deliver(data, self._heard(address))
+            self._hear(data, address)
 
     def error_received(self, error: Exception) -> None:  # noqa: ARG002
         self._connection.counts.dropped_out += 1
@@ -109,7 +111,7 @@ class UdpOutLink(OnePeerLink):
 
     async def _connect(self, connection: Connection) -> Endpoint:
         _, endpoint = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Connected(connection, lambda _: ""),
+            lambda: _Connected(connection, lambda data, _: connection.deliver(data, "")),
             remote_addr=(self._host, self._port),
             family=_family(self._host),
         )
@@ -117,7 +119,7 @@ class UdpOutLink(OnePeerLink):
 
 
 class UdpInLink(Link):
-    """Datagrams from whoever speaks to us; all of them are answered.
+    """Datagrams from whoever speaks to us; who sends what can be taken is answered.
 
     Parameters and attributes are those of `TcpInLink`, and
 
@@ -140,11 +142,14 @@ class UdpInLink(Link):
         self._local = host, port
         self._now_s = now_s
         self._socket: _Datagrams | None = None
-        self._peers: dict[Address, tuple[str, float]] = {}  # heard when; longest silent first
+        self._guests: dict[str, Guest] = {}  # by name
+        self._known: dict[Address, Guest] = {}
+        self._addresses: dict[str, Address] = {}  # theirs, and of the stranger who is heard
+        self._strangers = Strangers(name, self.counts)
 
     async def _hold(self, connection: Connection) -> None:
         transport, self._socket = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Datagrams(connection, self._heard),
+            lambda: _Datagrams(connection, partial(self._hear, connection)),
             local_addr=self._local,
             family=_family(self._local[0]),
         )
@@ -154,42 +159,63 @@ class UdpInLink(Link):
         finally:
             self._socket = None
 
-    def _heard(self, address: Address) -> str:
-        """Note that a peer spoke; return its name."""
-        if address in self._peers:
-            peer, _ = self._peers.pop(address)
+    def _hear(self, connection: Connection, data: bytes, address: Address) -> None:
+        """Take a datagram, if its sender may send so much."""
+        now_s = self._now_s()
+        guest = self._known.get(address)
+        if guest is None:
+            self._hear_stranger(connection, data, address, now_s)
+        elif guest.feeds(now_s) or guest.allowance.takes(max(len(data), FRAME_BYTES), now_s):
+            guest.note(connection.deliver(data, guest.name), now_s)
         else:
-            peer = address_text(address)
-            _log.info("%s: peer %s: new", self.name, peer)
-            if len(self._peers) == MOST_PEERS:
-                self._forget(next(iter(self._peers)))
-        self._peers[address] = peer, self._now_s()
-        return peer
+            self._strangers.refuse(now_s)
 
-    def _forget(self, address: Address) -> None:
-        peer, _ = self._peers.pop(address)
-        _log.info("%s: peer %s: forgotten", self.name, peer)
+    def _hear_stranger(
+        self, connection: Connection, data: bytes, address: Address, now_s: float
+    ) -> None:
+        """Take a stranger's datagram; if it was worth it, the stranger is a peer."""
+        host = address[0]
+        admitted = self._strangers.admits(host, now_s)
+        yielding = who_gives_way(host, self._guests, MOST_PEERS, now_s) if admitted else None
+        if yielding is None:
+            self._strangers.refuse(now_s)
+            return
+        name = address_text(address)
+        self._addresses[name] = address  # it may be answered at once
+        worth = connection.deliver(data, name)
+        if worth not in {Worth.FRAMES, Worth.SAMPLES}:
+            del self._addresses[name]
+            return
+        if yielding in self._guests:
+            self._forget(yielding)
+        self._known[address] = self._guests[name] = guest = Guest(name, host, now_s)
+        guest.note(worth, now_s)
+        _log.info("%s: peer %s: new", self.name, name)
+
+    def _forget(self, name: str) -> None:
+        del self._guests[name], self._known[self._addresses.pop(name)]
+        _log.info("%s: peer %s: forgotten", self.name, name)
 
     @property
     def peers(self) -> list[str]:
-        """Those who spoke in the last minute."""
+        """Those of whom something was taken in the last minute."""
         since_s = self._now_s() - SILENCE_S
-        for address in [a for a, (_, heard_s) in self._peers.items() if heard_s < since_s]:
-            self._forget(address)
-        return [peer for peer, _ in self._peers.values()]
+        for name in [name for name, guest in self._guests.items() if guest.heard_s < since_s]:
+            self._forget(name)
+        return list(self._guests)
 
     def send_to(self, data: bytes, peer: str) -> None:
         """Hand one frame to one of them; if it is not known the frame is dropped."""
-        for address, (name, _) in self._peers.items():
-            if name == peer and self._socket is not None:
-                self._socket.send(data, address)
-                return
-        self.counts.dropped_out += 1
+        address = self._addresses.get(peer)
+        if address is None or self._socket is None:
+            self.counts.dropped_out += 1
+        else:
+            self._socket.send(data, address)
 
     def send(self, data: bytes) -> None:
-        """Hand one frame to everyone who spoke in the last minute; without any it is dropped."""
+        """Hand one frame to everyone heard in the last minute; without any it is dropped."""
         if self._socket is None or not self.peers:
             self.counts.dropped_out += 1
             return
-        for address in self._peers:
+        for address in self._known:
             self._socket.send(data, address)

@@ -13,7 +13,7 @@ from risaf_link.mavlink.signing import LinkSigning
 from risaf_link.mavlink.telemetry import Emitter, Message, Rates
 
 MOST_PEERS = 256  # that are remembered
-FASTEST_US = 100.0  # shortest interval of a message: the array's rate is less anyway
+FASTEST_US = 1000.0  # shortest interval of a message: that of the fastest array
 LARGEST_INTERVAL_US = 2**31 - 1
 
 UNFED_US = 10_000_000  # that ODOMETRY may wait for the autopilot's HEARTBEAT
@@ -56,18 +56,18 @@ class Peers:
         self._links = links
         self._profile: Profile | None = None
         self._unfed_us: int | None = None  # since when somebody waits for ODOMETRY in vain
-        self._emitters: dict[Peer, Emitter] = {}
+        self._emitters: dict[Peer, Emitter] = {}  # who was sent something last is last
 
     def emitter(self, peer: Peer) -> Emitter:
         """The one that makes the frames for a peer."""
-        emitter = self._emitters.get(peer)
+        emitter = self._emitters.pop(peer, None)
         if emitter is None:
             terms = self._links.get(peer[0], ANY)
             rates = self._rates if terms.rates is None else terms.rates
             emitter = Emitter(rates, *self._own, terms.signing, self._profile)
-            self._emitters[peer] = emitter
-            if len(self._emitters) > MOST_PEERS:
+            if len(self._emitters) >= MOST_PEERS:
                 del self._emitters[next(iter(self._emitters))]
+        self._emitters[peer] = emitter
         return emitter
 
     def listening(self, peers: Iterable[Peer]) -> list[Peer]:
@@ -121,8 +121,7 @@ class Peers:
         if name is None or not sensible:
             return False
         rate = 0.0 if interval_us < 0 else 1e6 / max(interval_us, FASTEST_US)
-        self.emitter(peer).ask(name, rate if interval_us else None)
-        return True
+        return self.emitter(peer).ask(name, rate if interval_us else None)
 
     def interval_us(self, peer: Peer, message_id: int) -> int:
         """How often a peer gets a message, as MESSAGE_INTERVAL says it."""

@@ -79,6 +79,9 @@ class KeySnapshot(Struct, frozen=True):
     secret: bytes  # none: the one that is stored
     state: SigningState
 
+    def __repr__(self) -> str:  # no log shows a secret
+        return f"KeySnapshot(state={self.state!r})"
+
 
 class SetupSigning(Struct, frozen=True):
     """A SETUP_SIGNING message."""
@@ -86,6 +89,9 @@ class SetupSigning(Struct, frozen=True):
     to: tuple[int, int]
     ticks: int
     secret: bytes
+
+    def __repr__(self) -> str:
+        return f"SetupSigning(to={self.to!r}, ticks={self.ticks!r})"
 
 
 def ticks_at(unix_us: int) -> int:
@@ -232,6 +238,8 @@ class LinkSigning:
         As given.
     takes_setup : bool
         Whether SETUP_SIGNING is obeyed.
+    takes_all : bool
+        Whether every message may come without a signature.
     rejected : Counter
         Frames that were not taken, by `Rejection`.
     """
@@ -243,7 +251,7 @@ class LinkSigning:
         self._link_id = link_id
         self._signs = parameters.sign
         unsigned = parameters.accept_unsigned
-        self._takes_all = unsigned is True
+        self.takes_all = unsigned is True
         named = () if isinstance(unsigned, bool) else unsigned
         self._unsigned = {*ALWAYS_UNSIGNED, *(IDS[name] for name in named)}
 
@@ -274,7 +282,7 @@ class LinkSigning:
         """Whether a message may come without a signature; the first key cannot come with one."""
         first_key = self.takes_setup and not self.key.is_set
         return (
-            self._takes_all
+            self.takes_all
             or frame.message_id in self._unsigned
             or (first_key and frame.message_id == SETUP_SIGNING)
         )

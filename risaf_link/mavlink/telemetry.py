@@ -46,6 +46,7 @@ take it for the autopilot's. ODOMETRY is not: an autopilot may steer by it."""
 
 ONBOARD_CONTROLLER = 18  # MAV_TYPE
 MAVLINK_VERSION = 3
+MOST_ASKED = 2000.0  # Hz, of all messages that one peer asks for
 ESTIMATOR_ATTITUDE, ESTIMATOR_GPS_GLITCH = 1, 1024  # ESTIMATOR_STATUS_FLAGS
 UINT32_LIMIT = 2**32 - 1
 
@@ -111,12 +112,19 @@ class Emitter:
         self._rates = rates
         self._sent = {m: rate for m, rate in {**rates, **self._asked}.items() if rate > 0}
 
-    def ask(self, name: Message, rate: float | None) -> None:
-        """Let the peer have a message at so many Hz; 0: not at all, None: by default."""
+    def ask(self, name: Message, rate: float | None) -> bool:
+        """Let the peer have a message at so many Hz; 0: not at all, None: by default.
+
+        Returns whether it may: all that one asks for is no more than `MOST_ASKED`.
+        """
+        others = sum(hertz for other, hertz in self._asked.items() if other != name)
+        if rate and others + rate > MOST_ASKED:
+            return False
         self._asked.pop(name, None)
         if rate is not None:
             self._asked[name] = rate
         self.set_defaults(self._rates)
+        return True
 
     def emit(self, estimate: Estimate) -> list[bytes]:
         """Frames due at an estimate."""

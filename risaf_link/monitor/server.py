@@ -6,6 +6,7 @@ played.
 """
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -16,10 +17,12 @@ from risaf_link.address import shown
 from risaf_link.errors import ConfigError
 from risaf_link.monitor.source import Source
 from risaf_link.monitor.view import View
+from risaf_link.publish.visitor import may_ask
 
 PAGE = Path(__file__).parent / "page"
 PERIOD_S = 0.1  # from one update to the next
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+MOST_PAGES = 16  # that are open; a stream of updates each
+LARGEST_WISH = 4096  # bytes of what a page may say
 HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -72,7 +75,7 @@ async def serve(source: Source, host: str, port: int, started: Callable[[str], N
 def application(source: Source, host: str) -> web.Application:
     """Make the page's application."""
     pages = Pages(source, host)
-    made = web.Application(middlewares=[pages.check])
+    made = web.Application(middlewares=[pages.check], client_max_size=LARGEST_WISH)
     made.on_response_prepare.append(_add_headers)
     made.router.add_get("/", pages.index)
     made.router.add_get("/updates", pages.updates)
@@ -93,16 +96,14 @@ class Pages:
 
     def __init__(self, source: Source, host: str) -> None:
         self._source = source
-        self._is_local = host in LOOPBACK
+        self._host = host
+        self._open = 0  # streams
 
     @web.middleware
     async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse who reaches a page of this machine by another name.
-
-        A site whose name was made to mean 127.0.0.1 could read it.
-        """
-        if self._is_local and request.url.host not in LOOPBACK:
-            raise web.HTTPForbidden(text="ask for it by 127.0.0.1 or localhost")
+        """Refuse who was sent by another site, whose name was made to mean this address."""
+        if not may_ask(request.headers.get("Host", ""), self._host):
+            raise web.HTTPForbidden(text="ask for it by its address, or by this machine's name")
         return await handler(request)
 
     async def index(self, _: web.Request) -> web.FileResponse:
@@ -111,6 +112,15 @@ class Pages:
 
     async def updates(self, request: web.Request) -> web.StreamResponse:
         """The stream of what it shows, of the component `of=SYSTEM:COMPONENT` or of the first."""
+        if self._open >= MOST_PAGES:
+            raise web.HTTPServiceUnavailable(text=f"{MOST_PAGES} pages are open already")
+        self._open += 1
+        try:
+            return await self._stream(request)
+        finally:
+            self._open -= 1
+
+    async def _stream(self, request: web.Request) -> web.StreamResponse:
         response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
         await response.prepare(request)
         view = View(self._source, _wanted(request))
@@ -143,7 +153,7 @@ class Pages:
 
 def _wanted(request: web.Request) -> tuple[int, int] | None:
     system, _, component = request.query.get("of", "").partition(":")
-    if not (system.isdecimal() and component.isdecimal()):
+    if not all(re.fullmatch("[0-9]{1,3}", part) for part in (system, component)):
         return None
     return int(system), int(component)
 

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from risaf_link.links import Link
+from risaf_link.links import Link, Worth
 from risaf_link.mavlink.frame import FrameParser
 from risaf_link.mavlink.signing import LinkSigning
 from risaf_link.monitor.asking import Asking
@@ -96,7 +96,7 @@ class Live:
                     self._link.send(raw)
                 await asyncio.sleep(TICK_S)
 
-    def _receive(self, data: bytes, peer: str) -> None:
+    def _receive(self, data: bytes, peer: str) -> Worth:
         parser = self._parsers.pop(peer, None) or FrameParser()
         self._parsers[peer] = parser
         if len(self._parsers) > MOST_PEERS:
@@ -106,6 +106,7 @@ class Live:
             self._signing.key.advance(self.now_us)
             table = self._signing.taken(table)
         self.vehicles.take(table, np.full(len(table), self.now_us, np.uint64), peer)
+        return Worth.SAMPLES if table.cuts["known"].any() else Worth.NOTHING  # all of it is shown
 
 
 class Log:

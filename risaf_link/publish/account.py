@@ -16,6 +16,7 @@ class Traffic:
     dropped_out: int  # of these, frames that a peer did not get
     connections: int  # how often it came up
     peers: int  # now
+    dropped_in: int = 0  # datagrams and connections of those who want too much
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,6 +182,9 @@ def _of_traffic(account: Account) -> Iterator[Metric]:
     told = "Frames that a peer did not get, or that nobody was there for"
     dropped = [((t.link,), t.dropped_out) for t in links]
     yield _counter("link_frames_dropped_out", told, ("link",), dropped)
+    told = "Datagrams and connections of those who want too much"
+    refused = [((t.link,), t.dropped_in) for t in links]
+    yield _counter("link_dropped_in", told, ("link",), refused)
     ups = [((t.link,), t.connections) for t in links]
     yield _counter("link_connections", "How often a link came up", ("link",), ups)
     peers = [((t.link,), t.peers) for t in links]

@@ -6,17 +6,22 @@ It is read, never written to. Whoever is slow is waited for apart, and not for l
 import asyncio
 import logging
 import os
+import re
 from collections.abc import Awaitable, Callable
 
 from msgspec import Struct
 
 from risaf_link.address import address_in, shown
 from risaf_link.errors import ConfigError
+from risaf_link.mavlink.allowance import Allowance
+from risaf_link.publish.visitor import is_loopback, may_ask
 
 PATH = "/metrics"
 PATIENCE_S = 5.0  # with one who asks, all in all
 MOST_AT_ONCE = 8  # who ask; more are turned away
 LARGEST = 8192  # bytes of a request's head
+PAGES_A_SECOND, PAGES_AT_ONCE = 5.0, 20.0  # each takes some milliseconds; a server asks all 15 s
+HOST = re.compile(rb"(?im)^host:[ \t]*([^\s]*)[ \t]*\r$")
 AGAIN_S = 5.0  # until the port is tried again
 
 _log = logging.getLogger(__name__)
@@ -63,6 +68,7 @@ class Page:
         self._make = make
         self._kind = kind
         self._answering: set[asyncio.Task[None]] = set()
+        self._allowance = Allowance(PAGES_A_SECOND, PAGES_AT_ONCE)
 
     async def run(self) -> None:
         """Serve until cancelled; a port that is taken is tried again."""
@@ -122,6 +128,12 @@ class Page:
             return _reply("405 Method Not Allowed", "text/plain", b"only GET\n", "Allow: GET, HEAD")
         if path != PATH.encode():
             return _reply("404 Not Found", "text/plain", f"only {PATH}\n".encode())
+        asked = HOST.search(head)
+        host = asked[1].decode("latin-1") if asked else ""
+        if is_loopback(self._host) and not may_ask(host, self._host):
+            return _reply("403 Forbidden", "text/plain", b"ask for it by its address\n")
+        if not self._allowance.takes(1.0, asyncio.get_running_loop().time()):
+            return _reply("429 Too Many Requests", "text/plain", b"ask less often\n")
         reply = _reply("200 OK", self._kind, await self._make())
         return reply if method == b"GET" else reply.partition(b"\r\n\r\n")[0] + b"\r\n\r\n"
 
