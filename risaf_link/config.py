@@ -5,7 +5,8 @@ together, and what is wrong with them is said.
 """
 
 import re
-from collections.abc import Hashable, Iterable
+import reprlib
+from collections.abc import Iterable
 from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +17,7 @@ from msgspec import Meta, Struct, field, inspect
 
 from risaf_link.core.array import ArrayCalibration, Calibration
 from risaf_link.core.tunable import Tunable
+from risaf_link.document import parsed
 from risaf_link.errors import ConfigError, LinkError
 from risaf_link.links import RecordingParameters, open_link
 from risaf_link.mavlink.dialect import IDS
@@ -204,21 +206,9 @@ def _check_signing(where: str, link: LinkParameters) -> None:
             )
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that stands twice in the same place; YAML would take the last one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                line = node.value[i][0].start_mark.line + 1
-                raise yaml.YAMLError(f"line {line}: {key}: found twice, expected once")
-        return super().construct_mapping(node, deep)
-
-
 def _read_yaml(path: Path) -> Any:
     try:
-        return yaml.load(path.read_text(), _StrictLoader)  # noqa: S506 it is a SafeLoader
+        return parsed(path.read_text())
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
@@ -233,7 +223,7 @@ def _set(tree: dict[str, Any], setting: str) -> None:
     if not equals or not path:
         raise ConfigError(f"--set {setting}: expected KEY=VALUE")
     try:
-        value = yaml.safe_load(text)
+        value = parsed(text)
     except yaml.YAMLError:
         raise ConfigError(f"--set {path}: found {text!r}, expected a YAML value") from None
     *parents, key = path.split(".")
@@ -264,7 +254,7 @@ def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = C
     if "..." in steps:
         steps[steps.index("...")] = _culprit(error, tree, steps, schema)
     kinds = _kinds_at(schema, steps)
-    field_name = re.search(r"field `(.*)`", message)
+    field_name = re.search(r"field `(.*)`", message, re.DOTALL)
     if field_name:
         key = ".".join([*steps, field_name[1]])
         if message.startswith("Object missing"):
@@ -346,6 +336,12 @@ def _value_at(tree: Any, steps: list[str]) -> Any:
     return tree
 
 
+_BRIEFLY = reprlib.Repr()  # as `repr`, but of 60 characters it makes no gigabyte first
+_BRIEFLY.maxlevel = 3
+_BRIEFLY.maxlist = _BRIEFLY.maxdict = _BRIEFLY.maxtuple = 20
+_BRIEFLY.maxstring = _BRIEFLY.maxlong = _BRIEFLY.maxother = 200
+
+
 def _short(value: Any) -> str:
-    text = "nothing" if value is None else repr(value)
+    text = "nothing" if value is None else _BRIEFLY.repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

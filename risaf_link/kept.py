@@ -15,6 +15,7 @@ import yaml
 from msgspec import structs
 
 from risaf_link.config import Config, StateParameters, load
+from risaf_link.document import parsed
 from risaf_link.mavlink.parameters import Parameters, parameters_of
 
 HEAD = "# Parameters that were set over MAVLink; they go over the configuration.\n"
@@ -71,7 +72,7 @@ def kept_parameters(
     for name, value in found.items():
         parameter = known.get(name)
         usable = isinstance(value, int | float) and not isinstance(value, bool)
-        if parameter is None or not usable or not parameter.admits(float(value)):
+        if parameter is None or not usable or not parameter.admits(value):
             expected = parameter.expected if parameter else "a known parameter"
             _log.warning("%s: %s: found %r, expected %s; left out", path, name, value, expected)
         else:
@@ -143,7 +144,7 @@ def _place(config: Config, config_path: Path | None) -> Path | None:
 
 def _read(path: Path) -> dict[Any, Any]:
     try:
-        found = yaml.safe_load(path.read_text())
+        found = parsed(path.read_text())
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

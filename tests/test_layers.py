@@ -8,7 +8,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "risaf_link"
 LAYERS = [
     {"errors"},
-    {"private"},
+    {"private", "document"},
     {"core"},
     {"mavlink"},
     {"pipeline"},
