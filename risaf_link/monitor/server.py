@@ -6,6 +6,7 @@ played.
 """
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from risaf_link.monitor.view import View
 PAGE = Path(__file__).parent / "page"
 PERIOD_S = 0.1  # from one update to the next
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
+ADDRESS = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")  # SYSTEM:COMPONENT
 HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -129,7 +131,7 @@ class Pages:
             raise web.HTTPUnsupportedMediaType
         try:
             wish = msgspec.json.decode(await request.read(), type=Play)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise web.HTTPBadRequest(text=str(error)) from None
         if wish.seek_us is not None:
             player.seek(wish.seek_us)
@@ -141,10 +143,8 @@ class Pages:
 
 
 def _wanted(request: web.Request) -> tuple[int, int] | None:
-    system, _, component = request.query.get("of", "").partition(":")
-    if not (system.isdecimal() and component.isdecimal()):
-        return None
-    return int(system), int(component)
+    found = ADDRESS.fullmatch(request.query.get("of", ""))
+    return (int(found[1]), int(found[2])) if found else None
 
 
 async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
