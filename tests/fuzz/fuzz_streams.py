@@ -49,7 +49,8 @@ def stream(data: bytes) -> None:
         assert data[start - before :].startswith(frame.prefix + frame.raw)
         used.update(range(start - before, start + len(frame.raw)))
         _check_frame(frame)
-    assert len(used) + skipped == len(data)
+    twice = sum(len(f.prefix) + len(f.raw) for f in frames) - len(used)  # within signatures
+    assert 0 <= len(used) + skipped - len(data) <= twice
 
 
 def _parsed(pieces: Iterable[bytes], prefix: int) -> tuple[list[Frame], Counter[str], int]:
@@ -104,8 +105,9 @@ def replay(data: bytes) -> None:
     path.write_bytes(data[1:])
     try:
         found = survey(config, path)
-        survey_text(path, found)
-        pace_rows(found)
+        if data[-1] & 7 == 0:  # it takes as long as all the rest
+            survey_text(path, found)
+            pace_rows(found)
     except LogError as error:
         check_line(error)
     in_blocks, singly = (_replayed(config, path, each) for each in (False, True))

@@ -14,7 +14,7 @@ sys.path[:0] = [str(ROOT), str(HERE.parent)]
 import msgspec
 from fuzz_checks import drive
 from fuzz_files import a_state
-from fuzz_script import NAMES, line
+from fuzz_script import NAMES, line, messages
 from streams import MIXES, made, seeded, sequence
 
 from risaf_link.config import Config, dump
@@ -60,6 +60,7 @@ def seeds() -> dict[str, list[bytes]]:
         "stream": [head + each for head in (b"\0\1\5\11\100", b"\xff\7\7\7\7") for each in streams],
         "tlog": [b"\1\50\310\7" + each for each in (*fixtures, stamped, bare)],
         "replay": [bytes((k,)) + each for k, each in enumerate((stamped, *fixtures, bare))],
+        "kernel": [head + each for head in _heads() for each in (*streams[:3], *_epochs())],
         "ingest": inputs,
         "component": inputs,
         "service": [bytes((k,)) + each[1:] for k, each in enumerate(inputs)],
@@ -84,6 +85,20 @@ def _scripts() -> list[bytes]:
         told + epochs + jump + epochs + behind,
         told + epochs + fix + orders + epochs,
         *(line("HEARTBEAT") + line(name, repeat=10, steps=0x44) * 3 for name in NAMES),
+    ]
+
+
+def _heads() -> list[bytes]:
+    """What stands before a stream for kernel.cpp: how it is cut, and what array is looked for."""
+    return [
+        bytes((how, 1, 5, 9, 64, 200, 4, 100, forces, 10, 3, 0)) for how, forces in ((2, 0), (3, 4))
+    ]
+
+
+def _epochs() -> list[bytes]:
+    both = line("GYRO_ARRAY") + line("ACCEL_ARRAY", steps=0x11)
+    return [
+        b"".join(sent.raw for sent in messages(each)) for each in (line("GYRO_ARRAY") * 6, both * 4)
     ]
 
 
