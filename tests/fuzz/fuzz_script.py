@@ -27,9 +27,10 @@ NEAR, FAR, RADIO = ("ground", "10.0.0.2:14550"), ("ground", "10.0.0.3:14550"), (
 PEERS = [NEAR, FAR, RADIO]
 
 BOOT_US, START_US = 5_000_000, 1_767_225_600_000_000
+LATEST_US = 2**53  # the year 2255; what receives has a clock that makes sense, be it wrong
 STEPS_US = [
     *(10_000, 0, 1_000, 2_500, 25_000, 100_000, 300_000, 1_000_000),
-    *(5_000_000, 70_000_000, 10**12, -10_000, -300_000, -2_000_000, -(10**9), -(10**13)),
+    *(5_000_000, 70_000_000, 2**54, -10_000, -300_000, -2_000_000, -(10**9), -(2**55)),
 ]
 """By how much a clock goes on with each message."""
 
@@ -104,7 +105,7 @@ def messages(data: bytes, names: list[str] = NAMES) -> Iterator[Sent]:
         sender = OTHERS[(who & 31) % len(OTHERS)] if who & 32 else SENT[name]
         for _ in range(min(REPEATS[repeat % len(REPEATS)], LONGEST - sequence)):
             clock_us += STEPS_US[steps & 15]
-            received_us = max(received_us + STEPS_US[steps >> 4], 0)
+            received_us = min(max(received_us + STEPS_US[steps >> 4], 0), LATEST_US)
             message_id, payload = pack(name, **_sensible(name, clock_us, received_us, sequence))
             payload = _laid_over(payload, overlay, offset)
             raw = encode(message_id, payload, sequence % 256, *sender)
@@ -157,7 +158,7 @@ def _sensible(name: str, clock_us: int, received_us: int, sequence: int) -> dict
     """Fields of a message as a vehicle would send it at a time."""
     fields = _zeros(name).copy()
     told = {
-        "time_usec": max(clock_us, 0),
+        "time_usec": max(clock_us, 0) % 2**64,
         "time_boot_ms": clock_us // 1000 % 2**32,
         "time_unix_usec": received_us,
         "epoch_seq": sequence % 65536,
@@ -168,7 +169,8 @@ def _sensible(name: str, clock_us: int, received_us: int, sequence: int) -> dict
     }
     fields.update({field: value for field, value in told.items() if field in fields})
     if name == "TIMESYNC":
-        fields |= {"ts1": received_us // 4 * 4000 + OWN[1], "tc1": max(clock_us, 1) * 1000}
+        answer = max(clock_us, 1) * 1000 % 2**63 if sequence % 2 else 0  # else it is a request
+        fields |= {"ts1": received_us // 4 * 4000 + OWN[1], "tc1": answer}
     if name in {"GYRO_ARRAY", "ACCEL_ARRAY"}:
         readings = [(sequence * 7 + i * 13) % 9 - 4 for i in range(3 * SENSORS)]
         readings[2::3] = [value - (1961 if "ACCEL" in name else 0) for value in readings[2::3]]
