@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Coroutine, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -102,3 +102,12 @@ def drive() -> tuple[Sent, ...]:
     epochs = line("GYRO_ARRAY", steps=0x44, repeat=6) + line("ACCEL_ARRAY", steps=0x11)
     fix = line("GPS_RAW_INT", steps=0x11)
     return tuple(messages(told + (epochs + fix) * 30))
+
+
+def done(work: Coroutine[Any, Any, Any]) -> Any:
+    """Result of what waits for nothing but its turn."""
+    while True:
+        try:
+            assert work.send(None) is None, "it waits"
+        except StopIteration as end:
+            return end.value

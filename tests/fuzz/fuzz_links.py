@@ -1,18 +1,24 @@
 """Targets: what comes over links."""
 
 import hashlib
+import json
 import math
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from fuzz_checks import (
     ALL_GPS,
+    ROOM,
     check_config,
     check_estimates,
     configs,
     decoded_all,
+    done,
     frame_of,
 )
 from fuzz_script import INPUTS, ORDERS, PEERS, START_US, Sent, messages
@@ -24,6 +30,7 @@ from streams import KEY
 from risaf_link.config import Config
 from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
+from risaf_link.errors import LogError
 from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.dialect import CRC_EXTRA, IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
@@ -31,7 +38,11 @@ from risaf_link.mavlink.frame import Frame, FrameParser
 from risaf_link.mavlink.ingest import Ingest
 from risaf_link.mavlink.parameters import rounded
 from risaf_link.mavlink.signing import LinkSigning, SigningKey, SigningParameters
+from risaf_link.mavlink.tlog import LEAP_US, record
+from risaf_link.publish.access import MqttParameters, MqttRates
+from risaf_link.publish.scrape import MetricsParameters
 from risaf_link.remembered import decoded, encoded
+from risaf_link.replay import Replay, Selection
 from risaf_link.service import Service
 
 ARRAYS = [
@@ -166,13 +177,16 @@ EMITTED = [
 
 
 def service(data: bytes) -> None:
-    """Whatever is sent to the service, estimates stay possible and its own frames are sound."""
+    """Whatever is sent to the service, all that it says is sound, and a replay says the same."""
     base = configs()[data[0] % len(configs()) if data else 0]
-    wanted = dict.fromkeys(EMITTED, 20.0)
-    running = Deaf(structs.replace(base, emit=wanted))
-    for sent in messages(data[1:]):
+    outputs = {"mqtt": MqttParameters("mqtt://nobody", rates=MqttRates(50, 50, 50, 50))}
+    outputs |= {"metrics": MetricsParameters("127.0.0.1:1")}
+    config = structs.replace(base, emit=dict.fromkeys(EMITTED, 20.0), **outputs)
+    running, all_sent = Deaf(config), list(messages(data[1:]))
+    for sent in all_sent:
         running.receive(sent)
     running.end()
+    _check_replay(config, all_sent, running.tracks)
     last: dict[Any, int] = {}
     for (peer, raw), message in zip(
         running.sent, decoded_all(raw for _, raw in running.sent), strict=True
@@ -193,6 +207,7 @@ class Deaf(Service):
         super().__init__(config, clock_us=lambda: self.now_us)
         self.now_us = START_US
         self.sent: list[tuple[Any, bytes]] = []
+        self.tracks: list[bytes] = []
 
     def _peers(self) -> Iterator[tuple[str, str]]:
         return iter(PEERS)
@@ -203,7 +218,11 @@ class Deaf(Service):
     def _send(self, blocks: list[EstimateBlock]) -> None:
         for block in blocks:
             check_estimates(block)
+            self.tracks.append(block.track.values.tobytes())
         super()._send(blocks)
+
+    def _leave_out(self, output: Any) -> None:
+        raise AssertionError(f"{output} failed") from sys.exception()
 
     def receive(self, sent: Sent) -> None:
         """Take a frame from a peer, and do what is due by time."""
@@ -219,6 +238,25 @@ class Deaf(Service):
         """Do what is done at the end."""
         self._take_held()
         self._send(self.pipeline.flush(self.now_us))
+        mqtt, metrics = sorted(self._outputs, key=lambda each: type(each).__name__, reverse=True)
+        for topic in mqtt._topics:
+            json.loads(topic.last or b"{}", parse_constant=_refuse)
+        assert b"risaf_link" in done(metrics._make())
+
+
+def _check_replay(config: Config, sent: list[Sent], tracks: list[bytes]) -> None:
+    """A recording gives the same estimates, unless its stamps are such as no log has."""
+    times_us = [each.received_us for each in sent]
+    steps_us = [after - before for before, after in pairwise(times_us)]
+    if not sent or not all(0 <= step <= LEAP_US for step in steps_us):
+        return
+    path = ROOM / "recorded.tlog"
+    taken = [each for each in sent if each.name != "SETUP_SIGNING"]
+    path.write_bytes(b"".join(record(each.received_us, each.raw) for each in taken))
+    blocks, again = Replay(config, path, Selection()).blocks(), []
+    with suppress(LogError):  # it may hold nothing that can be used
+        again += [block.track.values.tobytes() for block in blocks]
+    assert b"".join(again) == b"".join(tracks)
 
 
 def _check_message(message: Any) -> None:
@@ -267,3 +305,7 @@ def _signed(sent: Sent, spoiled: int) -> bytes:
     digest = bytearray(hashlib.sha256(KEY + bytes(raw)).digest()[:6])
     digest[spoiled % 6] ^= 0x10 if spoiled & 7 == 7 else 0
     return bytes(raw + digest)
+
+
+def _refuse(number: str) -> None:
+    raise AssertionError(f"{number} is no JSON")

@@ -1,6 +1,5 @@
 """Target: what browsers and Prometheus ask, and what vehicles tell the page."""
 
-from collections.abc import Coroutine
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 from aiohttp import web
 from fuzz_checks import (
     check_update,
+    done,
     drive,
 )
 from fuzz_script import PEERS, START_US, STATUSES, messages
@@ -70,7 +70,7 @@ def _check_play(body: bytes) -> None:
     player = Player(_recording())
     pages = server.Pages(PlayedLog("a log", player), "127.0.0.1")
     try:
-        response = _done(pages.play(_asked({}, body)))
+        response = done(pages.play(_asked({}, body)))
     except web.HTTPException as refusal:
         response = refusal
     assert response.status in {204, 400}
@@ -88,14 +88,5 @@ def _check_metrics(head: bytes) -> None:
     async def make() -> bytes:
         return b"counters"
 
-    answer = _done(scrape.Page("127.0.0.1", 0, make, "text/plain")._response(head))
+    answer = done(scrape.Page("127.0.0.1", 0, make, "text/plain")._response(head))
     assert answer.split(b" ")[1] in {b"200", b"404", b"405"}
-
-
-def _done(work: Coroutine[Any, Any, Any]) -> Any:
-    """Result of what does not wait for anything."""
-    try:
-        work.send(None)
-    except StopIteration as end:
-        return end.value
-    raise AssertionError("it waits")
