@@ -87,11 +87,22 @@ class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
         """System and component id of this service."""
         return self.mavlink.system_id or 1, self.mavlink.component_id
 
+    @property
+    def hears_estimates(self) -> bool:
+        """Whether an autopilot's own estimate is believed: it must not be told ours."""
+        return "GLOBAL_POSITION_INT" in self.gps.messages
+
+    @property
+    def unsettable(self) -> frozenset[str]:
+        """Parameters that cannot be set: what they ask for is refused in a file as well."""
+        return frozenset({"RATE_ODOMETRY"} if self.hears_estimates else ())
+
 
 def identity_of(config: Config) -> Identity:
     """Whom a configuration makes us."""
     mavlink = config.mavlink
-    return Identity(*config.own, mavlink.system_id is None, mavlink.odometry)
+    odometry = None if config.hears_estimates else mavlink.odometry
+    return Identity(*config.own, mavlink.system_id is None, odometry)
 
 
 def load(path: Path | None, settings: Iterable[str] = ()) -> Config:
@@ -188,7 +199,7 @@ def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
 def _check_feeding(where: str, config: Config) -> None:
     """Refuse to tell an autopilot the heading that it tells us."""
     emitted = {*config.emit, *(name for link in config.links for name in link.emit or {})}
-    if "ODOMETRY" in emitted and "GLOBAL_POSITION_INT" in config.gps.messages:
+    if "ODOMETRY" in emitted and config.hears_estimates:
         raise ConfigError(
             f"{where}gps.messages: found GLOBAL_POSITION_INT, the autopilot's own estimate, "
             "expected none where ODOMETRY is emitted: it would hear itself"

@@ -86,7 +86,8 @@ def load_in_force(config_path: Path | None, settings: Iterable[str] = ()) -> Con
     Parameters and errors are those of `load`.
     """
     config = load(config_path, settings)
-    return Parameters(config, kept_parameters(config, config_path, settings).values).tuned
+    kept = kept_parameters(config, config_path, settings).values
+    return Parameters(config, kept, fixed=config.unsettable).tuned
 
 
 def load_for_replay(config_path: Path | None, settings: Iterable[str] = ()) -> Config:

@@ -116,7 +116,7 @@ class Service:
         supervisor: Supervisor | None = None,
     ) -> None:
         self._supervisor = supervisor or Supervisor({}, 0)
-        parameters = Parameters(config, kept.values, kept.overruled)
+        parameters = Parameters(config, kept.values, kept.overruled, config.unsettable)
         self._memory_file = memory_file(config)
         memory = self._memory_file.read()
         if memory:
