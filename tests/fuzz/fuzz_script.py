@@ -12,14 +12,17 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
+from risaf_link.config import Config
 from risaf_link.mavlink.dialect import CRC_EXTRA, IDS, MESSAGES, pack
 from risaf_link.mavlink.frame import encode
+from risaf_link.mavlink.parameters import parameters_of
 from risaf_link.mavlink.search import CHECKSUM, HEADERS, MARK_V1, MARK_V2, checksum_of
 
 HEAD = struct.Struct("<6B")
 LONGEST = 150  # messages of a script: more take too long
 REPEATS = (1, 1, 1, 1, 1, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 SENSORS = 4
+COMMANDS = [512, 511, 241, 245, 246, 510, 400]
 
 OWN, AUTOPILOT, ARRAY, GCS = (1, 191), (1, 1), (1, 158), (255, 190)
 OTHERS = [OWN, AUTOPILOT, ARRAY, GCS, (2, 1), (2, 158), (1, 159), (0, 0), (255, 255), (7, 191)]
@@ -171,11 +174,20 @@ def _sensible(name: str, clock_us: int, received_us: int, sequence: int) -> dict
     if name == "TIMESYNC":
         answer = max(clock_us, 1) * 1000 % 2**63 if sequence % 2 else 0  # else it is a request
         fields |= {"ts1": received_us // 4 * 4000 + OWN[1], "tc1": answer}
+    if name.startswith("COMMAND_"):
+        fields |= {"command": COMMANDS[sequence % len(COMMANDS)]}
+    if name.startswith("PARAM_") and "param_id" in fields:
+        fields |= {"param_id": _parameters()[sequence % len(_parameters())].encode()}
     if name in {"GYRO_ARRAY", "ACCEL_ARRAY"}:
         readings = [(sequence * 7 + i * 13) % 9 - 4 for i in range(3 * SENSORS)]
         readings[2::3] = [value - (1961 if "ACCEL" in name else 0) for value in readings[2::3]]
         fields["rates" if "GYRO" in name else "forces"] = readings + [0] * (120 - len(readings))
     return fields
+
+
+@cache
+def _parameters() -> list[str]:
+    return [parameter.name for parameter in parameters_of(Config)]
 
 
 @cache
@@ -220,11 +232,10 @@ _PARTICULAR: dict[str, dict[str, Any]] = {
     "SCALED_IMU": {"xgyro": 10, "zacc": -1000},
     "SCALED_IMU2": {"xgyro": 11, "zacc": -1000},
     "SCALED_IMU3": {"xgyro": 12, "zacc": -1000},
-    "COMMAND_LONG": {"command": 512, "param1": 31.0},
-    "COMMAND_INT": {"command": 511, "param1": 31.0, "param2": 100_000.0},
-    "PARAM_REQUEST_READ": {"param_id": b"FUS_GATE", "param_index": -1},
-    "PARAM_SET": {"param_id": b"FUS_GATE", "param_value": 4.5, "param_type": 9},
-    "COMMAND_ACK": {"command": 511},
+    "COMMAND_LONG": {"param1": 1.0},
+    "COMMAND_INT": {"param1": 31.0, "param2": 100_000.0},
+    "PARAM_REQUEST_READ": {"param_index": -1},
+    "PARAM_SET": {"param_value": 1.0, "param_type": 9},
     "SETUP_SIGNING": {"secret_key": list(range(32))},
     "ATTITUDE_QUATERNION": {"q1": 1.0},
     "NAMED_VALUE_FLOAT": {"name": b"bias_x", "value": 1e-3},
