@@ -181,7 +181,7 @@ def service(data: bytes) -> None:
     base = configs()[data[0] % len(configs()) if data else 0]
     outputs = {"mqtt": MqttParameters("mqtt://nobody", rates=MqttRates(50, 50, 50, 50))}
     outputs |= {"metrics": MetricsParameters("127.0.0.1:1")}
-    config = structs.replace(base, emit=dict.fromkeys(EMITTED, 20.0), **outputs)
+    config = structs.replace(base, emit=dict.fromkeys(EMITTED, 8.0), **outputs)
     running, all_sent = Deaf(config), list(messages(data[1:]))
     for sent in all_sent:
         running.receive(sent)
@@ -241,7 +241,8 @@ class Deaf(Service):
         mqtt, metrics = sorted(self._outputs, key=lambda each: type(each).__name__, reverse=True)
         for topic in mqtt._topics:
             json.loads(topic.last or b"{}", parse_constant=_refuse)
-        assert b"risaf_link" in done(metrics._make())
+        if len(self.sent) % 4 == 0:  # it takes as long as an epoch
+            assert b"risaf_link" in done(metrics._make())
 
 
 def _check_replay(config: Config, sent: list[Sent], tracks: list[bytes]) -> None:

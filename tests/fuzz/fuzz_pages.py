@@ -1,6 +1,7 @@
 """Target: what browsers and Prometheus ask, and what vehicles tell the page."""
 
 from functools import cache
+from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,13 +31,13 @@ def page(data: bytes) -> None:
     live = LiveLink()
     view = View(live, _wanted(asked))
     parsers = {peer: FrameParser() for peer in PEERS}
-    for sent in messages(data, [*STATUSES, "HEARTBEAT", "TIMESYNC", "GYRO_ARRAY"]):
-        table = parsers[sent.peer].receive_table(sent.raw)
-        live.now_us = max(live.now_us, sent.received_us)
-        times_us = np.full(len(table), live.now_us, np.uint64)
-        live.vehicles.take(table, times_us, sent.peer[1])
-        if sent.sequence % 8 == 0:
-            check_update(view)
+    sent = messages(data, [*STATUSES, "HEARTBEAT", "TIMESYNC", "GYRO_ARRAY"])
+    for (peer, _), group in groupby(sent, lambda each: (each.peer, each.sequence // 8)):
+        together = list(group)
+        table = parsers[peer].receive_table(b"".join(each.raw for each in together))
+        live.now_us = max(live.now_us, together[-1].received_us)
+        live.vehicles.take(table, np.full(len(table), live.now_us, np.uint64), peer[1])
+        check_update(view)
     check_update(view)
     check_update(View(live))
     _check_play(asked)
