@@ -120,8 +120,9 @@ void find_epochs(const Bytes& data, const std::vector<Cut>& cuts, const std::uin
   for (std::size_t i = 0; i < cuts.size(); ++i) {
     times_us.push_back(i * how[3] * 1000 << (how[4] & 63));
   }
-  const risaf::ArrayLayout array{1, 158, 0, {how[0], 1e-3, how[1] * 1.0}, {how[2], 1e-3, 1e9}};
-  risaf::EpochFinder finder(kinds, 1'000'000, 3'000'000);
+  const risaf::ArrayLayout array{1, 158, 0, {how[0], 1e-3, how[1] * 1.0}, {how[2], 1e-3, 1e9},
+                                 Bytes(how[5] & 1 ? 40 : 0)};
+  risaf::EpochFinder finder(kinds, INFO, 1'000'000, 3'000'000);
   const Bytes exact(data);
   finder.load(exact.data(), cuts.data(), times_us.data(), cuts.size());
   risaf::Clock clock{0, static_cast<std::uint16_t>(how[5] - 1)};
@@ -131,6 +132,9 @@ void find_epochs(const Bytes& data, const std::vector<Cut>& cuts, const std::uin
       const risaf::Sensors& sensors = is_gyro ? array.gyros : array.accels;
       std::vector<double> values(3 * sensors.count * epochs.size());
       finder.read(sensors, is_gyro, values.data());
+    }
+    for (const risaf::Aside& aside : finder.asides()) {
+      require(aside.row < cuts.size() && aside.before < epochs.size());
     }
     for (const risaf::EpochRows& epoch : epochs) {
       require(epoch.newest <= epoch.end && epoch.begun <= epoch.heard && epoch.end < cuts.size());
