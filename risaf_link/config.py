@@ -5,6 +5,7 @@ together, and what is wrong with them is said.
 """
 
 import re
+import reprlib
 from collections.abc import Iterable
 from copy import deepcopy
 from pathlib import Path
@@ -86,11 +87,22 @@ class Config(PipelineParameters, frozen=True, forbid_unknown_fields=True):
         """System and component id of this service."""
         return self.mavlink.system_id or 1, self.mavlink.component_id
 
+    @property
+    def hears_estimates(self) -> bool:
+        """Whether an autopilot's own estimate is believed: it must not be told ours."""
+        return "GLOBAL_POSITION_INT" in self.gps.messages
+
+    @property
+    def unsettable(self) -> frozenset[str]:
+        """Parameters that cannot be set: what they ask for is refused in a file as well."""
+        return frozenset({"RATE_ODOMETRY"} if self.hears_estimates else ())
+
 
 def identity_of(config: Config) -> Identity:
     """Whom a configuration makes us."""
     mavlink = config.mavlink
-    return Identity(*config.own, mavlink.system_id is None, mavlink.odometry)
+    odometry = None if config.hears_estimates else mavlink.odometry
+    return Identity(*config.own, mavlink.system_id is None, odometry)
 
 
 def load(path: Path | None, settings: Iterable[str] = ()) -> Config:
@@ -194,7 +206,7 @@ def _check_links(where: str, links: tuple[LinkParameters, ...]) -> None:
 def _check_feeding(where: str, config: Config) -> None:
     """Refuse to tell an autopilot the heading that it tells us."""
     emitted = {*config.emit, *(name for link in config.links for name in link.emit or {})}
-    if "ODOMETRY" in emitted and "GLOBAL_POSITION_INT" in config.gps.messages:
+    if "ODOMETRY" in emitted and config.hears_estimates:
         raise ConfigError(
             f"{where}gps.messages: found GLOBAL_POSITION_INT, the autopilot's own estimate, "
             "expected none where ODOMETRY is emitted: it would hear itself"
@@ -262,7 +274,7 @@ def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = C
     if "..." in steps:
         steps[steps.index("...")] = _culprit(error, tree, steps, schema)
     kinds = _kinds_at(schema, steps)
-    field_name = re.search(r"field `(.*)`", message)
+    field_name = re.search(r"field `(.*)`", message, re.DOTALL)
     if field_name:
         key = ".".join([*steps, field_name[1]])
         if message.startswith("Object missing"):
@@ -344,6 +356,12 @@ def _value_at(tree: Any, steps: list[str]) -> Any:
     return tree
 
 
+_BRIEFLY = reprlib.Repr()  # as `repr`, but of 60 characters it makes no gigabyte first
+_BRIEFLY.maxlevel = 3
+_BRIEFLY.maxlist = _BRIEFLY.maxdict = _BRIEFLY.maxtuple = 20
+_BRIEFLY.maxstring = _BRIEFLY.maxlong = _BRIEFLY.maxother = 200
+
+
 def _short(value: Any) -> str:
-    text = "nothing" if value is None else repr(value)
+    text = "nothing" if value is None else _BRIEFLY.repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,13 +1,15 @@
 """YAML that people or machines have written, read with care.
 
 Nothing but plain values comes of it. A key that stands twice is an error, where YAML would take the
-last one. A document that is too large, too deep, or too large once its aliases are written out, is
-an error as well: a few lines of aliases make billions of values.
+last one; so is text that cannot be written to a file, or name one; and so is a document that is too
+large, too deep, or too large once its aliases are written out: a few lines of them make billions of
+values.
 """
 
+import reprlib
 from collections.abc import Hashable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 
@@ -22,9 +24,22 @@ class DocumentError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        if not isinstance(node, yaml.ScalarNode):
+            return super().construct_object(node, deep)
+        try:
+            value = super().construct_object(node, deep)
+        except (ArithmeticError, AttributeError, LookupError, ValueError):  # numbers, dates
+            kind = node.tag.rpartition(":")[2]
+            _refuse(node.start_mark, f"{reprlib.repr(node.value)}, expected one of kind {kind}")
+        if isinstance(value, str) and not _is_text(value):
+            _refuse(node.start_mark, "characters that are not for text")
+        return value
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         found: set[Hashable] = set()
-        for key_node, _ in node.value:
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        for key_node, _ in pairs:
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, Hashable):
                 continue  # which is told below
@@ -98,6 +113,14 @@ def _weigh(node: yaml.Node, weights: dict[int, int], depth: int) -> int:
         if weights[id(node)] > MOST_VALUES:
             raise DocumentError(f"found more than {MOST_VALUES} values, expected fewer")
     return weights[id(node)]
+
+
+def _refuse(mark: yaml.Mark, found: str) -> NoReturn:
+    raise yaml.YAMLError(f"line {mark.line + 1}: found {found}")
+
+
+def _is_text(value: str) -> bool:
+    return "\0" not in value and not any("\ud800" <= character <= "\udfff" for character in value)
 
 
 def _too_deep() -> DocumentError:

@@ -2,7 +2,14 @@
 
 
 class RisafError(Exception):
-    """Anything that this package reports as an error; its text is one line."""
+    """Anything that this package reports as an error; its text is one line.
+
+    What it quotes may hold line breaks, or tell a terminal what to do: it is told as Python writes
+    such characters.
+    """
+
+    def __str__(self) -> str:
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in super().__str__())
 
 
 class ConfigError(RisafError):

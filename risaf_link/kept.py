@@ -71,7 +71,7 @@ def kept_parameters(
     for name, value in found.items():
         parameter = known.get(name)
         usable = isinstance(value, int | float) and not isinstance(value, bool)
-        if parameter is None or not usable or not parameter.admits(float(value)):
+        if parameter is None or not usable or not parameter.admits(value):
             expected = parameter.expected if parameter else "a known parameter"
             _log.warning("%s: %s: found %r, expected %s; left out", path, name, value, expected)
         else:
@@ -85,7 +85,8 @@ def load_in_force(config_path: Path | None, settings: Iterable[str] = ()) -> Con
     Parameters and errors are those of `load`.
     """
     config = load(config_path, settings)
-    return Parameters(config, kept_parameters(config, config_path, settings).values).tuned
+    kept = kept_parameters(config, config_path, settings).values
+    return Parameters(config, kept, fixed=config.unsettable).tuned
 
 
 def load_for_replay(config_path: Path | None, settings: Iterable[str] = ()) -> Config:

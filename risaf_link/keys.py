@@ -238,6 +238,6 @@ def _read_state(path: Path, where: str) -> SigningState:
         return SigningState()
     try:
         return msgspec.json.decode(content, type=SigningState)
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, UnicodeDecodeError):
         _log.warning("%sfound %s damaged: the clock starts anew", where, state_path(path).name)
         return SigningState()

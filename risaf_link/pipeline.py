@@ -12,6 +12,7 @@ from itertools import groupby
 from zlib import crc32
 
 import msgspec
+import numpy as np
 from msgspec import Struct, field, structs
 
 from risaf_link.core.array import ArrayCalibration, Calibration
@@ -115,13 +116,16 @@ class Pipeline:
     def memory(self) -> Memory | None:
         """Tell what is known, so that it outlasts a restart; None: it is not worth it, or not yet.
 
-        It is not while an older memory is on trial; and of other fusions than `robust` and other
-        filters than `eskf` nothing can be told.
+        It is not while an older memory is on trial, nor at an epoch without a valid reading on some
+        axis; and of other fusions than `robust` and other filters than `eskf` nothing can be told.
         """
         latest = self._latest
         if latest is None or self._start.is_on_trial:
             return None
-        parts = self._start.estimator.memory(latest.track.values[-1, WALK].copy())
+        walk = latest.track.values[-1, WALK].copy()
+        if not np.isfinite(walk).all():
+            return None
+        parts = self._start.estimator.memory(walk)
         if parts is None:
             return None
         gyros, accelerometers, attitude = parts

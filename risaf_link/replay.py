@@ -111,7 +111,7 @@ class Replay:
         memory = memory_file(config).read()
         self._pipeline = Pipeline(config, config.own, load_calibration(config), memory)
         self.identity = identity_of(config)
-        parameters = Parameters(config, fixed=selection.fixed)
+        parameters = Parameters(config, fixed={*selection.fixed, *config.unsettable})
         self._component = Component(parameters, self._pipeline, self.identity, keep=self._keep)
         self._gps = Ingest(config.array, config.gps, config.own)
         self._gps_ids = {IDS[name] for name in config.gps.messages}

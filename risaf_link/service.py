@@ -74,7 +74,7 @@ class Service:
         supervisor: Supervisor | None = None,
     ) -> None:
         self._supervisor = supervisor or Supervisor({}, 0)
-        parameters = Parameters(config, kept.values, kept.overruled)
+        parameters = Parameters(config, kept.values, kept.overruled, config.unsettable)
         file = memory_file(config)
         memory = file.read()
         if memory:

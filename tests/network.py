@@ -58,10 +58,13 @@ class Network:
     """A component, two ground stations on one link, and time."""
 
     def __init__(self, config: Config | None = None, adopts: bool = False, **options: Any) -> None:
-        self.parameters = Parameters(config or Config(), options.pop("kept", None))
+        config = config or Config()
+        kept = options.pop("kept", None)
+        self.parameters = Parameters(config, kept, fixed=config.unsettable)
         self.estimator = options.pop("estimator", None) or Recorder()
+        odometry = None if config.hears_estimates else "auto"
         self.component = Component(
-            self.parameters, self.estimator, Identity(*OWN, adopts), **options
+            self.parameters, self.estimator, Identity(*OWN, adopts, odometry), **options
         )
         self.peers = [NEAR, FAR]
         self.now_us = 77_000_000

@@ -147,6 +147,18 @@ def test_settings_go_over_the_file(tmp_path):
         ("metrics: {listen: ':9100'}", "metrics.listen: found ':9100', expected ADDRESS:PORT"),
         ("- 1", "found [1], expected keys with values"),
         ("fusion: {", "while parsing a flow"),
+        ("x: 2026-13-45", "line 1: found '2026-13-45', expected one of kind timestamp"),
+        ("\nx: !!int ten", "line 2: found 'ten', expected one of kind int"),
+        ("x: !!bool maybe", "line 1: found 'maybe', expected one of kind bool"),
+        ("x: 0x_", "line 1: found '0x_', expected one of kind int"),
+        (f"x: {'9' * 5000}", "found a value of more than 2048 characters"),
+        ("x: !!map y", "expected a mapping node, but found scalar"),
+        ("[" * 2000, "found values more than 32 deep"),
+        ("{" * 2000, "found values more than 32 deep"),
+        ('array: {calibration: "a\\0"}', "line 1: found characters that are not for text"),
+        ('state: {file: "\\ud800"}', "line 1: found characters that are not for text"),
+        ('? "a\\nb"\n: 1', r"a\nb: unknown key; known: array, gps"),
+        ('links: [{name: "a\\n\\e[2J", url: x}]', r"links.0.url: a\n\x1b[2J: 'x' found, one of"),
         ("a: b: c", "mapping values are not allowed here"),
     ],
 )
@@ -157,7 +169,7 @@ def test_one_line_says_key_found_and_expected(tmp_path, text, message):
     line = str(caught.value)
     assert message in line
     assert line.startswith(f"{path}: ")
-    assert "\n" not in line
+    assert line.isprintable()
 
 
 @pytest.mark.parametrize(
@@ -168,6 +180,11 @@ def test_one_line_says_key_found_and_expected(tmp_path, text, message):
         ("links.7.url=udpin://a:1", "--set links.7.url: no such key"),
         ("fusion.alpha.x=1", "--set fusion.alpha.x: no such key"),
         ("fusion.alpha={", "--set fusion.alpha: found '{', expected a YAML value"),
+        (
+            "fusion.alpha=2026-13-45",
+            "--set fusion.alpha: found '2026-13-45', expected a YAML value",
+        ),
+        ("a\nb", r"--set a\nb: expected KEY=VALUE"),
     ],
 )
 def test_a_wrong_setting_is_named(setting, message):

@@ -235,6 +235,10 @@ class TestKeptFile:
             ("[1]", "found [1], expected names with values"),
             ("a: b: c", "mapping values are not allowed"),
             ("\xff", "left out"),
+            (f"FUS_GATE: {10**400}", "expected 2 to 1000"),
+            ("FUS_GATE: !!float x", "found 'x', expected one of kind float; left out"),
+            ("FUS_GATE: 2026-13-45", "expected one of kind timestamp; left out"),
+            ("[" * 2000, "found more than 32 levels; left out"),
         ],
     )
     def test_what_cannot_be_used_is_said_and_left_out(self, tmp_path, caplog, text, said):

@@ -25,9 +25,9 @@ HARMFUL = {
     "deep": ("[" * 20_000, "found values more than 32 deep in one another, expected fewer"),
     "large": ("#" * LARGEST + "\n#", "found more than 1000000 bytes, expected YAML"),
     "long number": ("a: 0x" + "f" * 5000, "found a value of more than 2048 characters"),
-    "no date": ("a: 2026-99-99", "month must be in 1..12"),
+    "no date": ("a: 2026-99-99", "line 1: found '2026-99-99', expected one of kind timestamp"),
     "code": ("a: !!python/object/apply:os.system [x]", "could not determine a constructor"),
-    "no boolean": ("a: !!bool maybe", "found a tag that does not fit its value, expected none"),
+    "no boolean": ("a: !!bool maybe", "line 1: found 'maybe', expected one of kind bool"),
     "unhashable key": ("? [1]\n: 2", "found unhashable key"),
 }
 

@@ -187,11 +187,12 @@ def test_a_clock_that_cannot_be_stored_keeps_the_service_from_starting(tmp_path)
         keys.open()
 
 
-def test_a_damaged_state_is_told_and_left_out(tmp_path, caplog):
+@pytest.mark.parametrize("damage", [b'{"ticks": -1}', b'{"ti\xdb": 1}', b""])
+def test_a_damaged_state_is_told_and_left_out(tmp_path, caplog, damage):
     path = key_file(tmp_path)
     state = Path(f"{path}.state")
     state.touch(0o600)
-    state.write_bytes(b'{"ticks": -1}')
+    state.write_bytes(damage)
     assert open_keys(config(path)).links["a"].key.ticks == 0
     assert "found signing.key.state damaged" in caplog.text
 

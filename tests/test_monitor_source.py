@@ -252,6 +252,17 @@ async def test_the_stream_brings_updates(recording):
         response.close()
 
 
+@pytest.mark.parametrize(
+    "wish", ["", "1", "1:", "1:191:1", "-1:191", "\u0661:191", "9" * 5000 + ":1"]
+)
+async def test_a_component_that_is_none_is_not_asked_for(recording, wish):
+    player = Player(recording)
+    player.seek(NOW_US + 100_000_000)
+    async with browsing(Log("drive.tlog", player)) as client:
+        response = await client.get("/updates", params={"of": wish})
+        assert (await next_update(response))["chosen"] == [1, 191]
+
+
 async def test_a_page_tells_how_a_log_is_played(recording):
     player = Player(recording)
     async with browsing(Log("drive.tlog", player)) as client:
@@ -262,6 +273,11 @@ async def test_a_page_tells_how_a_log_is_played(recording):
         assert player.now_us == NOW_US + 60_000_000
         for wrong in ({"seek": 3}, {"speed": "fast"}, [], {"seek_us": "now"}):
             assert (await client.post("/play", json=wrong)).status == 400
+        for damage in (b"", b'{"\xff": 1}', b"[" * 10_000):
+            answer = await client.post(
+                "/play", data=damage, headers={"Content-Type": "application/json"}
+            )
+            assert answer.status == 400
         text = json.dumps({"is_paused": False})  # what another site's form can send
         assert (await client.post("/play", data=text)).status == 415
         assert player.is_paused

@@ -21,6 +21,7 @@ from wire import frame
 
 from risaf_link.config import Config, identity_of, load
 from risaf_link.errors import ConfigError
+from risaf_link.kept import load_in_force
 from risaf_link.mavlink.odometry import PROFILES, quality_of
 from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.telemetry import DEFAULT_RATES, Emitter
@@ -29,7 +30,7 @@ from risaf_link.pipeline import Pipeline
 from risaf_link.replay import OutputLog, Replay, Selection
 
 ODOMETRY = 331
-ACCEPTED, REJECTED = 0, 1
+ACCEPTED, REJECTED, DENIED = 0, 1, 2
 REBOOT, SET, REQUEST = 246, 511, 512
 GENERIC, ARDUPILOT, PX4 = 0, 3, 12  # MAV_AUTOPILOT
 PEER = ("autopilot", "")
@@ -40,10 +41,11 @@ PERIOD_US = 10_000
 class Feed(Network):
     """A vehicle, the service, and what its autopilot hears: messages with their times, us."""
 
-    def __init__(self, autopilot=None, rate=30.0) -> None:
-        self.pipeline = Pipeline(Config(), OWN)
+    def __init__(self, autopilot=None, rate=30.0, config=None) -> None:
+        config = config or Config()
+        self.pipeline = Pipeline(config, OWN)
         terms = {"autopilot": Terms(rates={"ODOMETRY": rate})}
-        super().__init__(estimator=self.pipeline, links=terms)
+        super().__init__(config, estimator=self.pipeline, links=terms)
         self.peers = [PEER]
         self.vehicle = Vehicle(5)
         self.time_us = BOOT_US
@@ -372,6 +374,21 @@ class TestConfiguration:
         load(None, [key])
         with pytest.raises(ConfigError, match=r"gps\.messages: found GLOBAL_POSITION_INT"):
             load(None, [key, "gps.messages=[GPS_RAW_INT, GLOBAL_POSITION_INT]"])
+
+    def test_nor_when_a_ground_station_asks_for_it(self, tmp_path):
+        config = load(None, ["gps.messages=[GPS_RAW_INT, GLOBAL_POSITION_INT]"])
+        feed = Feed(public.MAV_AUTOPILOT_PX4, config=config)
+        assert not feed.go(2.0, course=1.0)
+        assert acks(feed.command(SET, ODOMETRY, 1e6 / 50, peer=PEER)) == [(SET, DENIED)]
+        assert acks(feed.command(REQUEST, ODOMETRY, peer=PEER)) == [(REQUEST, DENIED)]
+        error, value = feed.set("RATE_ODOMETRY", 30.0, peer=PEER)
+        assert (error.get_type(), value.param_value) == ("PARAM_ERROR", 0.0)
+        assert not feed.go(1.0, course=1.0)
+        path = tmp_path / "vehicle.yaml"
+        path.write_text("gps: {messages: [GLOBAL_POSITION_INT]}\n")
+        (tmp_path / "vehicle.parameters.yaml").write_text("RATE_ODOMETRY: 30\nFUS_GATE: 5\n")
+        in_force = load_in_force(path)
+        assert ("ODOMETRY" in in_force.emit, in_force.fusion.gate) == (False, 5.0)
 
 
 def test_a_replay_of_ardupilots_log_tells_what_ardupilot_would_use():

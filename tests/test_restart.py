@@ -162,6 +162,21 @@ def test_what_is_written_is_read_again(memory, tmp_path):
     assert encoded(again) == encoded(memory)
 
 
+@pytest.mark.parametrize("axes", [(0, 1, 2), (1,)])
+def test_an_epoch_without_a_valid_reading_leaves_the_state_as_it_was(axes):
+    vehicle, pipeline = Vehicle(4), Pipeline(Config(), (1, 191))
+    pipeline.step(vehicle.info(), 1)
+    for k in range(1, 6):
+        pipeline.step(vehicle.epoch(10_000 * k), 10_000 * k)
+    assert decoded(encoded(pipeline.memory())).time_us == 50_000
+    rate = np.zeros((4, 3))
+    rate[:, axes] = np.nan
+    pipeline.step(vehicle.epoch(60_000, rate), 60_000)
+    assert pipeline.memory() is None
+    pipeline.step(vehicle.epoch(70_000), 70_000)
+    assert decoded(encoded(pipeline.memory())).time_us == 70_000
+
+
 @given(st.data())
 def test_a_file_that_is_not_a_state_is_an_error_and_nothing_else(memory, data):
     content = bytearray(encoded(memory))

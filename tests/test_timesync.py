@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from network import FAR, GCS, NEAR, OWN, Network, of
+from network import FAR, GCS, NEAR, OWN, Network, Recorder, of
 from pymavlink.dialects.v20 import all as public
 from test_clock import ARRAY_US, AUTOPILOT, START_US, VEHICLE_US, framed, heartbeat, system_time
 from wire import frame
@@ -99,6 +99,15 @@ def test_what_others_are_asked_we_do_not_answer(to):
     fields = {"tc1": 0, "ts1": 5, "target_system": to[0], "target_component": to[1]}
     network.component.receive(framed("TIMESYNC", GCS, **fields), NEAR, network.now_us)
     assert network.heard() == {}
+
+
+def test_a_clock_that_shows_more_than_an_answer_holds_is_not_told():
+    estimator = Recorder()
+    network = Network(estimator=estimator)
+    request = frame("TIMESYNC", GCS, tc1=0, ts1=5)
+    for clock_us, answers in [((2**63 - 1) // 1000, 1), ((2**63 - 1) // 1000 + 1, 0), (2**62, 0)]:
+        estimator.now_us = lambda _, shown=clock_us: shown
+        assert len(network.take(request)) == answers
 
 
 def test_an_answer_is_not_answered():

@@ -331,9 +331,14 @@ class Component:
 
     def _set_interval(self, order: Order) -> Result:
         wanted = order.integer
-        if wanted is None or not self._peers.ask(order.peer, wanted, order.parameters[1]):
+        if wanted is None or self._must_not_tell(wanted):
+            return Result.DENIED
+        if not self._peers.ask(order.peer, wanted, order.parameters[1]):
             return Result.DENIED
         return Result.ACCEPTED
+
+    def _must_not_tell(self, wanted: int) -> bool:
+        return wanted == IDS["ODOMETRY"] and not self._identity.feeds
 
     def _tell_interval(self, order: Order) -> Result:
         return self._post_interval(order.integer, order)
@@ -347,7 +352,7 @@ class Component:
 
     def _request(self, order: Order) -> Result:
         wanted = order.integer
-        if wanted is None:
+        if wanted is None or self._must_not_tell(wanted):
             return Result.DENIED
         if wanted in EMITTED:
             emitter, name = self._peers.emitter(order.peer), EMITTED[wanted]

@@ -33,22 +33,25 @@ class Identity:
         Whom we are.
     adopts : bool
         Whether the system id of the one autopilot that is heard is taken.
-    odometry : str
-        Which autopilot ODOMETRY is for; auto: our vehicle's, as its HEARTBEAT tells.
+    odometry : str or None
+        Which autopilot ODOMETRY is for; auto: our vehicle's, as its HEARTBEAT tells; None: none.
 
     Attributes
     ----------
     profile : Profile or None
         How that one takes it; None: not known.
+    feeds : bool
+        Whether there may ever be one.
     """
 
     def __init__(
-        self, system: int, component: int, adopts: bool, odometry: ProfileName = "auto"
+        self, system: int, component: int, adopts: bool, odometry: ProfileName | None = "auto"
     ) -> None:
         self.system = system
         self.component = component
-        self.profile = PROFILES.get(odometry)
-        self._follows = self.profile is None  # the autopilot's HEARTBEAT
+        self.feeds = odometry is not None
+        self.profile = PROFILES.get(odometry or "")
+        self._follows = odometry == "auto"  # the autopilot's HEARTBEAT
         self._armed_us: int | None = None  # when the autopilot last said that it is
         self._undecided = adopts
         self._heard: set[int] = set()  # systems with an autopilot

@@ -21,6 +21,7 @@ from risaf_link.mavlink.dialect import reader
 from risaf_link.mavlink.frame import Frame
 
 LONGEST_TRIP_US = 10_000  # of an answer that is believed
+LATEST_US = (2**63 - 1) // 1000  # that fits into nanoseconds; an array's clock may show more
 
 
 class Timesync(Struct, frozen=True):
@@ -56,8 +57,11 @@ def answer_to(
     asked, asker = timesync_in(frame), (frame.system, frame.component)
     if asked.tc1 != 0 or not concerns(asked.to, own) or asker == own:
         return None
+    now_us = max(clock_us(), 1)
+    if now_us > LATEST_US:
+        return None
     return {
-        "tc1": max(clock_us(), 1) * 1000,
+        "tc1": now_us * 1000,
         "ts1": asked.ts1,
         "target_system": asker[0],
         "target_component": asker[1],

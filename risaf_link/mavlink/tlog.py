@@ -22,6 +22,7 @@ RECEIVED, SENT = 0, 3
 
 LEAP_US = 600_000_000  # a log is hardly ever silent for so long
 LOOKAHEAD = 8  # records
+LATEST_US = 1 << 62  # no clock shows more; twice as much is no int64
 SAMPLE = 16384  # bytes that tell a log with stamps from one without
 
 Stamps = NDArray[np.uint64]
@@ -166,14 +167,14 @@ def _is_believable(stamp: int, last: int | None, following: Sequence[int]) -> bo
 
 
 def _stamps(table: FrameTable) -> tuple[Stamps, Mask]:
-    """Stamps of the frames, and which frames have one."""
+    """Stamps of the frames, and which frames have one that a clock may have shown."""
     stamped = table.cuts["prefix"] >= STAMP.size
     stamps = np.zeros(len(table), np.uint64)
     if stamped.any():
         size = len(table.buffer) - STAMP.size + 1
         at = np.ndarray(size, ">u8", table.buffer, strides=1)  # what starts at each byte
         stamps[stamped] = at[table.cuts["start"][stamped] - STAMP.size]
-    return stamps & ~np.uint64(3), stamped
+    return stamps & ~np.uint64(3), stamped & (stamps <= LATEST_US)
 
 
 def _run(mask: Mask, start: int) -> int:

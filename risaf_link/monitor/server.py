@@ -23,6 +23,7 @@ PAGE = Path(__file__).parent / "page"
 PERIOD_S = 0.1  # from one update to the next
 MOST_PAGES = 16  # that are open; a stream of updates each
 LARGEST_WISH = 4096  # bytes of what a page may say
+ADDRESS = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")  # SYSTEM:COMPONENT
 HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -140,7 +141,7 @@ class Pages:
             raise web.HTTPUnsupportedMediaType
         try:
             wish = msgspec.json.decode(await request.read(), type=Play)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise web.HTTPBadRequest(text=str(error)) from None
         if wish.seek_us is not None:
             player.seek(wish.seek_us)
@@ -152,10 +153,8 @@ class Pages:
 
 
 def _wanted(request: web.Request) -> tuple[int, int] | None:
-    system, _, component = request.query.get("of", "").partition(":")
-    if not all(re.fullmatch("[0-9]{1,3}", part) for part in (system, component)):
-        return None
-    return int(system), int(component)
+    found = ADDRESS.fullmatch(request.query.get("of", ""))
+    return (int(found[1]), int(found[2])) if found else None
 
 
 async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
