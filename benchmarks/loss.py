@@ -5,7 +5,7 @@
 A drive with truth is sent as datagrams, spoiled on the way, and read as the service reads them;
 GPS is gone for a part of it. The whole run and the time without GPS are judged apart. A lie is an
 epoch whose heading is off by more than three of the standard deviations that were told with it, or
-whose time stamp is off by more than 0.1 s: an honest estimate has 0.27 % of them.
+whose time stamp is that of no epoch that was sent: an honest estimate has 0.27 % of them.
 """
 
 import argparse

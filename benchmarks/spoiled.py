@@ -5,7 +5,6 @@ frames may be wrong though their checksum holds, as one in 65536 of those garble
 """
 
 import math
-import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -31,7 +30,7 @@ from risaf_link.sim.stream import EPOCH_START_US, SYSTEM
 
 BURST = 100  # datagrams, mean: a quarter of a second of 60 gyros and accelerometers at 100 Hz
 HEADER, CHECKSUM = 10, 2  # bytes of MAVLink 2, without a signature
-LATE_US = 100_000  # a stamp that is further from its epoch's is astray
+OLDEST_US, OFF_US = 10_000_000, 1_000  # an output is of an epoch that was sent so long ago at most
 Datagram = tuple[int, bytes]
 """When it is sent, us of the vehicle's clock; a frame."""
 
@@ -93,13 +92,16 @@ def _forged(raw: bytes, generator: np.random.Generator) -> bytes:
     return raw[:1] + bytes(content) + checksum_of(bytes(content), extra)
 
 
+def messages(scenario: Scenario) -> Iterator[Message]:
+    """What a scenario's array and autopilot send, not framed yet."""
+    sources = (array.status, array.epochs, autopilot.gps, _clock)
+    yield from merge(*(source(scenario) for source in sources), key=by_time)
+
+
 def sent(scenario: Scenario) -> Iterator[Datagram]:
     """Frames of a scenario's array and autopilot, a datagram each."""
-    sources = (array.status, array.epochs, autopilot.gps, _clock)
     numbers = {AUTOPILOT: 0, ARRAY: 0}
-    for time_us, component, message_id, payload in merge(
-        *(source(scenario) for source in sources), key=by_time
-    ):
+    for time_us, component, message_id, payload in messages(scenario):
         yield time_us, encode(message_id, payload, numbers[component] & 0xFF, SYSTEM, component)
         numbers[component] += 1
 
@@ -132,9 +134,9 @@ class Receiver:
         That were taken.
     """
 
-    def __init__(self, settings: Iterable[str] = ()) -> None:
-        config = load(None, settings)
-        self.pipeline = Pipeline(config, config.own)
+    def __init__(self, kind: type[Pipeline] = Pipeline) -> None:
+        config = load(None)
+        self.pipeline = kind(config, config.own)
         self.frames = 0
         self._blocks = BlockReader(
             self.pipeline.ingest, self.pipeline.assembler, apart=HEARD, longest=1
@@ -184,7 +186,9 @@ class Errors:
         """Hold them against the truth at the instants that they name."""
         boot_us, sent_us = np.array(self.boot_us), np.array(self.sent_us)
         since = (boot_us - BOOT_US) / 1e6
-        astray = np.abs(boot_us - sent_us) > LATE_US
+        period_us = 1e6 / scenario.rate
+        off_us = np.abs((boot_us - BOOT_US + period_us / 2) % period_us - period_us / 2)
+        astray = (off_us > OFF_US) | (boot_us > sent_us) | (boot_us < sent_us - OLDEST_US)
         q_nb = np.concatenate(
             [scenario.trajectory(part).q_nb for part in np.array_split(since[~astray], 64)]
         )
@@ -227,9 +231,3 @@ class Verdict:
     def where(self, mask: NDArray[np.bool_]) -> "Verdict":
         """Part of it; the epochs that were sent are not parted."""
         return Verdict(self.since[mask], self.error[mask], self.std[mask], 0, self.epochs)
-
-
-def stamp_of(raw: bytes) -> int:
-    """Time stamp of a frame of the array, us."""
-    (time_us,) = struct.unpack_from("<Q", raw, HEADER)
-    return int(time_us)
