@@ -218,7 +218,10 @@ def drive(seed: int, kills: int, first: int) -> Iterator[tuple[Life, list[str]]]
     chosen = scenario(name, seed, sensors=SENSORS, duration=3600.0)
     port = _free_port()
     vehicle = Vehicle(chosen, port)
-    with tempfile.TemporaryDirectory(prefix="restarted") as place:
+    with tempfile.TemporaryDirectory(
+        prefix="restarted",
+        ignore_cleanup_errors=True,  # the last recorder may still write
+    ) as place:
         folder, ports = Path(place), (port, vehicle.port)
         service = Service(folder / "life", ports, PERIODS_S[0])
         try:

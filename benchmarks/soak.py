@@ -271,10 +271,11 @@ class Honesty:
 
     def __str__(self) -> str:
         count = max(self.epochs, 1)
+        rms_deg = math.degrees(math.sqrt(self.error / count))
         return (
             f"{self.epochs} epochs, {100 * self.beyond / count:.3f} % beyond 3 sigma, "
             f"worst {self.worst:.1f}, RMS of error over sigma "
-            f"{math.sqrt(self.squares / count):.2f}, RMS {math.degrees(math.sqrt(self.error / count)):.2f} deg"
+            f"{math.sqrt(self.squares / count):.2f}, RMS {rms_deg:.2f} deg"
         )
 
 
@@ -287,7 +288,8 @@ class Soak:
         self.all, self.sound = Honesty(), Honesty()
         self.by_kind: Counter[str] = Counter()  # lies, by what was happening
         self.memory_mb: list[float] = []
-        self._found: list[tuple[int, EstimateBlock]] = []
+        self._found: list[tuple[int, tuple[int, ...], EstimateBlock]] = []
+        """When, by which offsets of the array's clock then, what."""
         faults = day.scenario.receiver_faults.values()
         spoilt = [(f.begin, f.begin + f.length) for f in faults]  # type: ignore[attr-defined]
         self._spoilt = np.array(spoilt).reshape(-1, 2)
@@ -299,7 +301,7 @@ class Soak:
             self.whole += arrival.samples
             self.handed += 1
             blocks = self.receiver.take(arrival.data, arrival.received_us)
-            self._found += [(arrival.true_us, block) for block in blocks]
+            self._note(arrival.true_us, blocks)
             if len(self._found) >= 2048:
                 self._judge()
             if arrival.true_us >= told_s * 1_000_000:
@@ -309,26 +311,36 @@ class Soak:
                 print(f"{hour} h: {self.memory_mb[-1]:.1f} MB; {self.all}", flush=True)
                 told_s += 3600
         last_us = round(self.day.scenario.duration * 1e6)
-        self._found += [(last_us, block) for block in self.receiver.pipeline.flush(0)]
+        self._note(last_us, self.receiver.pipeline.flush(0))
         self._judge()
+
+    def _note(self, true_us: int, blocks: list[EstimateBlock]) -> None:
+        offsets_us = tuple(self.way.offsets_us)
+        self._found += [(true_us, offsets_us, block) for block in blocks]
 
     def _judge(self) -> None:
         found, self._found = self._found, []
         if not found:
             return
-        known = [block.track.aligned for _, block in found]
-        now = np.concatenate(
-            [np.full(int(k.sum()), t) for (t, _), k in zip(found, known, strict=True)]
-        )
-        stamp = np.concatenate([b.time_us[k] for (_, b), k in zip(found, known, strict=True)])
+        rows = [
+            np.column_stack(
+                (
+                    np.full(int(known.sum()), now_us),
+                    block.time_us[known],
+                    np.tile(offsets_us, (int(known.sum()), 1)),
+                )
+            )
+            for now_us, offsets_us, block in found
+            for known in [block.track.aligned]
+        ]
+        now, stamp, *offsets = np.concatenate(rows).T
         if not len(stamp):
             return
-        yaw = np.concatenate(
-            [yaws_of(b.track.q_nb[k]) for (_, b), k in zip(found, known, strict=True)]
-        )
-        std = np.concatenate([b.track.yaw_std[k] for (_, b), k in zip(found, known, strict=True)])
+        tracks = [block.track for *_, block in found]
+        yaw = np.concatenate([yaws_of(track.q_nb[track.aligned]) for track in tracks])
+        std = np.concatenate([track.yaw_std[track.aligned] for track in tracks])
         # An epoch of before the array was started again may come out after.
-        true = np.array([stamp - offset - BOOT_US for offset in self.way.offsets_us])
+        true = np.array([stamp - offset - BOOT_US for offset in offsets])
         age = now - true
         first = (age[0] >= 0) & ((age[0] <= age[1]) | (age[1] < 0))
         true_us = np.where(first, true[0], true[1])

@@ -67,6 +67,14 @@ class Spoil:
         return draw >= ends if gone else draw < ends * self.lost / (1.0 - self.lost)
 
 
+def resealed(raw: bytes, at: int, bits: int) -> bytes:
+    """Turn some bits of a byte of header or payload round, and put the checksum right."""
+    content = bytearray(raw[1:-CHECKSUM])
+    content[at - 1] ^= bits
+    extra = CRC_EXTRA[int.from_bytes(content[6:9], "little")]
+    return raw[:1] + bytes(content) + checksum_of(bytes(content), extra)
+
+
 def _flipped(raw: bytes, share: float, generator: np.random.Generator) -> bytes:
     count = generator.binomial(8 * len(raw), share)
     if not count:
