@@ -14,7 +14,7 @@ that is right. So the headings are judged together.
   confirmed before: ten seconds of headings do not outweigh minutes.
 - The course of a vehicle in reverse is turned round.
 - A heading of before a gap in the readings, that comes after it, does not tell what the vehicle has
-  turned in the gap, and is not used.
+  turned in the gap, and is not used; nor is one that comes before the first reading.
 """
 
 import math
@@ -249,7 +249,7 @@ class HeadingGuard:
         """Use what one fix says; None: it says nothing of heading."""
         self._catch_up()
         self._hear(motion)
-        if motion.heading is None or self._is_of_before_gap(motion.heading):
+        if motion.heading is None or not self._tells_of_now(motion.heading):
             return None
         pause = self._elapsed - self._last
         self._last = self._elapsed
@@ -263,8 +263,10 @@ class HeadingGuard:
             return self._set(estimator.reset_heading, self._measured(motion))
         return self._judge(estimator, motion, pause)
 
-    def _is_of_before_gap(self, heading: Heading) -> bool:
-        return self._elapsed - self._parameters.delay - heading.age < self._gap_end
+    def _tells_of_now(self, heading: Heading) -> bool:
+        """Whether what was turned since is known: there are epochs, and no gap in them."""
+        read_s = self._elapsed - self._parameters.delay - heading.age
+        return self._turns > 1 and read_s >= self._gap_end
 
     def ahead(self, motion: Motion) -> float:
         """Speed of the vehicle, not the antenna, ahead, m/s, by the fix that was just taken.
