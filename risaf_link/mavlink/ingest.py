@@ -69,6 +69,13 @@ class ArrayInfo:
     sensors: int  # 0: not known
     payload: bytes = b""  # that said so; empty: it is assumed
 
+    def contradicts(self, other: "ArrayInfo") -> bool:
+        """Whether an array of this name cannot be both."""
+        return self.name == other.name and (self.gyro_scale, str(self.accel_scale)) != (
+            other.gyro_scale,
+            str(other.accel_scale),  # NaN is NaN here
+        )
+
     def count_of(self, is_gyro: bool) -> tuple[float, float]:
         """Scale of a count, NaN: not known; and from which magnitude on a reading is saturated."""
         scale, limit = (
@@ -97,8 +104,8 @@ class Ingest:
     counts : Counter
         Frames that were not used: `own`, `malformed`, `unscaled` (nothing has told the scale of
         the array yet), `superseded` (the sensor comes in a better message), `absent` (there is no
-        such sensor), `contested` (an array says of itself something else than before; it is
-        believed when it says so again), `other_source`, `no_fix`, `repeated_fix`; readings of one
+        such sensor), `contested` (an array of the same name tells another scale than before; it
+        is believed when it says so again), `other_source`, `no_fix`, `repeated_fix`; readings of one
         axis that are not valid: `invalid`, `saturated`.
     """
 
@@ -255,7 +262,8 @@ class Ingest:
             frame.payload,
         )
         key = (frame.system, frame.component, array_id)
-        if self._infos.get(key, info) != info != self._contested.get(key):
+        known = self._infos.get(key, info)
+        if known.contradicts(info) and info != self._contested.get(key):
             _remember(self._contested, key, info)
             self.counts["contested"] += 1
             return
