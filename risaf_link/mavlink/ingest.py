@@ -105,8 +105,8 @@ class Ingest:
         Frames that were not used: `own`, `malformed`, `unscaled` (nothing has told the scale of
         the array yet), `superseded` (the sensor comes in a better message), `absent` (there is no
         such sensor), `contested` (an array of the same name tells another scale than before; it
-        is believed when it says so again), `other_source`, `no_fix`, `repeated_fix`; readings of one
-        axis that are not valid: `invalid`, `saturated`.
+        is believed when it says so again), `other_source`, `no_fix`, `repeated_fix`; readings of
+        one axis that are not valid: `invalid`, `saturated`.
     """
 
     def __init__(self, array: ArrayParameters, gps: GpsParameters, own: tuple[int, int]) -> None:
