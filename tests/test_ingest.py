@@ -108,6 +108,14 @@ class TestOurDialect:
         assert reader.counts == Counter(malformed=1)
         assert reader.decode(array(1, [(1, 1, 1)]), 0).rates_s == pytest.approx(1e-3)
 
+    def test_an_array_that_says_otherwise_is_believed_when_it_says_so_again(self):
+        reader = ingest(info(), info(gyro_scale=2e-3), info())
+        assert reader.decode(array(1, [(1, 1, 1)]), 0).rates_s == pytest.approx(1e-3)
+        assert reader.counts == Counter(contested=1)
+        reader = ingest(info(), info(gyro_scale=2e-3), info(gyro_scale=2e-3), info(gyro_scale=2e-3))
+        assert reader.decode(array(1, [(1, 1, 1)]), 0).rates_s == pytest.approx(2e-3)
+        assert reader.counts == Counter(contested=1)
+
     @pytest.mark.parametrize("scale", [0.0, -1.0, math.inf, math.nan])
     def test_a_scale_that_cannot_be_means_no_accelerometers(self, scale):
         told = ingest(info(accel_scale=scale)).info(array_source(0))

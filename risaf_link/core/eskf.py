@@ -56,6 +56,7 @@ from risaf_link.core.error_state import (
     yaw_row,
 )
 from risaf_link.core.fusion import FusedRate
+from risaf_link.core.gap import Gaps, Step
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.memory import FilterMemory, known_errors
 from risaf_link.core.quaternion import Quaternion, Vector
@@ -98,7 +99,9 @@ class Eskf:
         self._rate = np.zeros(3)
         self._drive_ib = drive(np.eye(3), self._rate)
         self._unseen = np.zeros(3)  # s, each axis, since its rate was known
+        self._gaps = Gaps()
         self._turned: Vector = (0.0, 0.0, 0.0)  # rotation vector of the last step
+        self._in_gap = False  # whether that had a gap
         tilt = p.initial_tilt_std**2
         bias = p.initial_bias_std**2
         scale, force = p.scale_std**2, p.accel_bias_std**2
@@ -239,7 +242,8 @@ class Eskf:
 
         The rate is held to be the mean over the step, as that of a gyro with a filter is; what the
         axis of rotation turned from step to step is put right (coning: Savage, "Computational
-        Elements for Strapdown Systems", RTO-SET-116, 2008).
+        Elements for Strapdown Systems", RTO-SET-116, 2008). A step that is longer than usual was
+        not read as a whole: see `gap`.
 
         Parameters
         ----------
@@ -255,20 +259,24 @@ class Eskf:
         known = np.abs(fused.rate_b) < LARGEST_RATE  # false for NaN
         held = np.where(self._unseen < LONG_STEP, self._rate, 0.0)
         read = np.where(known, fused.rate_b - self._bias, held)
-        self._rate = np.where(known, read - self._scale @ read, held)
-        unseen = self._see(known, dt)
+        rate_before, self._rate = self._rate, np.where(known, read - self._scale @ read, held)
+        step = self._gaps.take(rate_before, self._rate, known, dt)
+        has_gap = bool(step.unseen.any())
+        unseen = self._see(known, dt, has_gap)
         before = self._by_rate
         self._by_rate = quaternion.unit(
-            quaternion.product(before, quaternion.exp(self._rotation(dt)))
+            quaternion.product(before, quaternion.exp(self._rotation(step, has_gap)))
         )
         self._drive_ib = drive(
-            quaternion.matrix(quaternion.between(before, self._by_rate, 0.5)), self._rate
+            quaternion.matrix(quaternion.between(before, self._by_rate, 0.5)), step.rate_b
         )
         x, y, z = self._earth_rate()
         self._turn((-x * dt, -y * dt, -z * dt))
         self._elapsed += dt
         self._history.append((self._elapsed, self._by_rate))
-        self._spread(self.matrix_ni @ self._drive_ib, fused, unseen, dt)
+        self._spread(self.matrix_ni @ self._drive_ib, fused, unseen, step.told, dt)
+        if has_gap:
+            self._spread_gap(step.unseen)
 
     def compare_heading(
         self, heading: float, variance: float, age: float, gate: float
@@ -418,34 +426,37 @@ class Eskf:
             np.sqrt(np.diag(self._covariance)[BIAS]),
         )
 
-    def _rotation(self, dt: float) -> Vector:
+    def _rotation(self, step: Step, has_gap: bool) -> Vector:
         """Rotation vector of a step, from the rate of this step and of the one before."""
-        x, y, z = (self._rate * dt).tolist()
-        a, b, c = self._turned if dt < LONG_STEP else (0.0, 0.0, 0.0)
-        self._turned = (x, y, z)
+        x, y, z = (step.rate_b * step.told).tolist()
+        follows = not (self._in_gap or has_gap) and step.told < LONG_STEP
+        a, b, c = self._turned if follows else (0.0, 0.0, 0.0)
+        self._turned, self._in_gap = (x, y, z), has_gap
         return (
             x + (b * z - c * y) / 12.0,
             y + (c * x - a * z) / 12.0,
             z + (a * y - b * x) / 12.0,
         )
 
-    def _see(self, known: NDArray[np.bool_], dt: float) -> Floats:
-        """Variance of what each axis turned unseen in a step, rad^2, (3,).
+    def _see(self, known: NDArray[np.bool_], dt: float, has_gap: bool) -> Floats:
+        """Variance of what each axis turned unseen in a step, rad^2, (3,), but for a gap.
 
         A rate that is held stays right for a moment; in `LONG_STEP` it has become any rate.
         """
-        seen = known & (dt <= LONG_STEP)
+        seen = known & (has_gap or dt <= LONG_STEP)
         before, self._unseen = self._unseen, np.where(seen, 0.0, self._unseen + dt)
         turned = [UNKNOWN_RATE * t * np.minimum(t / LONG_STEP, 1.0) for t in (self._unseen, before)]
         variance: Floats = np.where(seen, 0.0, turned[0] ** 2 - turned[1] ** 2)
         self._unseen[known] = 0.0
         return variance
 
-    def _spread(self, drive_nb: Floats, fused: FusedRate, unseen: Floats, dt: float) -> None:
-        """Carry the covariance on: `angle' = angle - drive dt gyro`, and the noise of both."""
-        angle, walk = self._noise(fused, unseen, dt)
+    def _spread(
+        self, drive_nb: Floats, fused: FusedRate, unseen: Floats, told: float, dt: float
+    ) -> None:
+        """Carry the covariance on: `angle' = angle - drive told gyro`, and the noise of both."""
+        angle, walk = self._noise(fused, unseen, told, dt)
         matrix_nb = drive_nb[:, 0:3]
-        turned_nb = drive_nb * dt
+        turned_nb = drive_nb * told
         covariance = self._covariance
         covariance[ATTITUDE] -= turned_nb @ covariance[GYRO]
         among = covariance[ATTITUDE, ATTITUDE] - covariance[ATTITUDE, GYRO] @ turned_nb.T
@@ -461,8 +472,21 @@ class Eskf:
         covariance[BIAS_AXES, BIAS_AXES] += walk
         self._bound()
 
+    def _spread_gap(self, unseen: Floats) -> None:
+        """Add the variance of what each axis turned in a gap; a level vehicle stays level."""
+        matrix_nb = self.matrix
+        turned = (matrix_nb * unseen) @ matrix_nb.T
+        most = 2.0 * self._parameters.initial_tilt_std**2
+        scale = np.ones(3)
+        for axis in (0, 1):
+            if turned[axis, axis] > most:
+                scale[axis] = math.sqrt(most / turned[axis, axis])
+        turned *= np.outer(scale, scale)
+        self._covariance[ATTITUDE, ATTITUDE] += (turned + turned.T) / 2.0
+        self._bound()
+
     def _noise(
-        self, fused: FusedRate, unseen: Floats, dt: float
+        self, fused: FusedRate, unseen: Floats, told: float, dt: float
     ) -> tuple[list[float], list[float]]:
         """Variances that a step adds to each axis: of the angle, rad^2, of the bias, (rad/s)^2."""
         p = self._parameters
@@ -470,10 +494,10 @@ class Eskf:
         angle, walk = [], []
         axes = zip(fused.noise.tolist(), fused.bias_walk.tolist(), unseen.tolist(), strict=True)
         for noise, bias_walk, unknown in axes:
-            white = noise * dt * dt if 0.0 <= noise < LARGEST_RATE**2 else 0.0  # false for NaN
-            told = 0.0 <= bias_walk < LARGEST_RATE
+            white = noise * told * told if 0.0 <= noise < LARGEST_RATE**2 else 0.0  # false for NaN
+            walks = 0.0 <= bias_walk < LARGEST_RATE
             angle.append(white + common + unknown)
-            walk.append(((bias_walk**2 if told else 0.0) + p.common_bias_walk**2) * dt)
+            walk.append(((bias_walk**2 if walks else 0.0) + p.common_bias_walk**2) * dt)
         return angle, walk
 
     def _bound(self) -> None:

@@ -13,6 +13,8 @@ that is right. So the headings are judged together.
   is to say if they are all off by the same angle, as far as the gyros' bias is known, and if they
   do so for as long as yaw was confirmed before: ten seconds of headings do not outweigh minutes.
 - The course of a vehicle in reverse is turned round.
+- A heading of before a gap in the readings, that comes after it, does not tell what the vehicle has
+  turned in the gap, and is not used; nor is one that comes before the first reading.
 """
 
 import math
@@ -25,7 +27,7 @@ import numpy as np
 from risaf_link.core.attitude import UNSEEN_TURN, Innovation, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
-from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
+from risaf_link.core.heading import Heading, HeadingParameters, HeadingSource, Motion
 from risaf_link.core.rotation import Floats, wrap, wraps
 from risaf_link.core.track import BIAS_STD, Track
 
@@ -41,6 +43,10 @@ AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides thei
 RATES = 1024  # epochs; a second at 1 kHz
 ROOM = 4 * RATES  # so that room has to be made only now and then
 RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
+SHORTEST_GAP, LONG_STEPS = (
+    0.1,
+    3.0,
+)  # s, and usual steps: what is shorter is turned all but steadily
 
 Estimator = Eskf | PaperFilter
 Measured = tuple[float, float, float]
@@ -177,6 +183,8 @@ class HeadingGuard:
         self._unread_epochs = 0
         self._turned = np.zeros((ROOM, 4))  # rad, the rate's integral in body axes; s
         self._turns = 1  # how many of them are known
+        self._usual = math.inf  # s, from epoch to epoch
+        self._gap_end = -math.inf  # s, of the last gap in them
         self._aligned = False
         self._bias_std = 0.0  # rad/s, on the axis on which it is largest
         self._confirmed = 0.0  # s for which headings have agreed with yaw
@@ -214,11 +222,21 @@ class HeadingGuard:
             track = Track(np.concatenate([each.values for each in tracks]))
             elapsed, dt = np.concatenate(times), np.concatenate(steps)
         self._unread, self._unread_epochs = [], 0
+        self._note_gaps(elapsed, dt)
         self._turn(track.rate_b, elapsed, dt)
         self.gear.feel(track.ahead, dt)
         self._elapsed = float(elapsed[-1])
         self._aligned = bool(track.aligned[-1])
         self._bias_std = float(track.values[-1, BIAS_STD].max())
+
+    def _note_gaps(self, elapsed: Floats, dt: Floats) -> None:
+        """Take note of the last step that is much longer than usual."""
+        fifth = len(dt) // 5
+        usual = float(np.partition(dt, fifth)[fifth])
+        self._usual = usual if usual < self._usual else 0.9 * self._usual + 0.1 * usual
+        (gaps,) = np.nonzero(dt > max(SHORTEST_GAP, LONG_STEPS * self._usual))
+        if len(gaps):
+            self._gap_end = float(elapsed[gaps[-1]])
 
     def _turn(self, rate_b: Floats, elapsed: Floats, dt: Floats) -> None:
         """Go on with the rate's integral."""
@@ -242,7 +260,7 @@ class HeadingGuard:
         """Use what one fix says; None: it says nothing of heading."""
         self._catch_up()
         self._hear(motion)
-        if motion.heading is None:
+        if motion.heading is None or not self._tells_of_now(motion.heading):
             return None
         pause = self._elapsed - self._last
         self._last = self._elapsed
@@ -255,6 +273,11 @@ class HeadingGuard:
             self.gear.turn_round()
             return self._set(estimator.reset_heading, self._measured(motion))
         return self._judge(estimator, motion, pause)
+
+    def _tells_of_now(self, heading: Heading) -> bool:
+        """Whether what was turned since is known: there are epochs, and no gap in them."""
+        read_s = self._elapsed - self._parameters.delay - heading.age
+        return self._turns > 1 and read_s >= self._gap_end
 
     def ahead(self, motion: Motion) -> float:
         """Speed of the vehicle, not the antenna, ahead, m/s, by the fix that was just taken.

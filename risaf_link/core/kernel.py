@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import structs
 
-from risaf_link.core import aiding, eskf, fusion, quaternion, robust
+from risaf_link.core import aiding, eskf, fusion, gap, quaternion, robust
 from risaf_link.core.attitude import AttitudeParameters, AttitudeState
 from risaf_link.core.compiled import native
 from risaf_link.core.error_state import Correction, Gravity, Outcome
@@ -133,7 +133,7 @@ Told = tuple[float, float, float, bool, int, int]
 
 def _numbers(parameters: AttitudeParameters, heading: HeadingParameters) -> Any:
     """Parameters of the filter, and the constants of its modules, for the kernel."""
-    constants = {**vars(eskf), **vars(aiding), **structs.asdict(parameters)}
+    constants = {**vars(gap), **vars(eskf), **vars(aiding), **structs.asdict(parameters)}
     constants |= {name: constants[name].tolist() for name in _BY_AXIS}
     constants |= {"offset_std": heading.offset_std, "delay_std": heading.delay_std}
     return native.FilterNumbers(constants)

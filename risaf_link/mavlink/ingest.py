@@ -69,6 +69,13 @@ class ArrayInfo:
     sensors: int  # 0: not known
     payload: bytes = b""  # that said so; empty: it is assumed
 
+    def contradicts(self, other: "ArrayInfo") -> bool:
+        """Whether an array of this name cannot be both."""
+        return self.name == other.name and (self.gyro_scale, str(self.accel_scale)) != (
+            other.gyro_scale,
+            str(other.accel_scale),  # NaN is NaN here
+        )
+
     def count_of(self, is_gyro: bool) -> tuple[float, float]:
         """Scale of a count, NaN: not known; and from which magnitude on a reading is saturated."""
         scale, limit = (
@@ -97,8 +104,9 @@ class Ingest:
     counts : Counter
         Frames that were not used: `own`, `malformed`, `unscaled` (nothing has told the scale of
         the array yet), `superseded` (the sensor comes in a better message), `absent` (there is no
-        such sensor), `other_source`, `no_fix`, `repeated_fix`; readings of one axis that are not
-        valid: `invalid`, `saturated`.
+        such sensor), `contested` (an array of the same name tells another scale than before; it
+        is believed when it says so again), `other_source`, `no_fix`, `repeated_fix`; readings of
+        one axis that are not valid: `invalid`, `saturated`.
     """
 
     def __init__(self, array: ArrayParameters, gps: GpsParameters, own: tuple[int, int]) -> None:
@@ -108,6 +116,9 @@ class Ingest:
         self.own = own
         self._arrays, self._receivers = Choice(), Choice()
         self._infos: dict[tuple[int, int, int], ArrayInfo] = {}
+        # What contradicts them: one frame in 65536 that are garbled has a checksum that holds, and
+        # a wrong scale turns the vehicle.
+        self._contested: dict[tuple[int, int, int], ArrayInfo] = {}
         self._imus = Streams(FINEST_FIRST)
         self._autopilot: Source | None = None  # whose they are
         self._last_fixes: dict[Hashable, tuple[int, bytes]] = {}
@@ -250,7 +261,14 @@ class Ingest:
             sensors,
             frame.payload,
         )
-        _remember(self._infos, (frame.system, frame.component, array_id), info)
+        key = (frame.system, frame.component, array_id)
+        known = self._infos.get(key, info)
+        if known.contradicts(info) and info != self._contested.get(key):
+            _remember(self._contested, key, info)
+            self.counts["contested"] += 1
+            return
+        self._contested.pop(key, None)
+        _remember(self._infos, key, info)
 
     def _gyro_array(self, frame: Frame, received_us: int) -> GyroChunk | None:
         return self._dialect_array(frame, received_us, is_gyro=True)

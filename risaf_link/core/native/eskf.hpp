@@ -22,11 +22,12 @@ using Errors = std::array<double, ERRORS>;
 using ByErrors = std::array<Errors, 3>;
 using State = std::array<double, STATES>;
 
-// Parameters of the filter, and constants of eskf.py and aiding.py, all told by Python.
+// Parameters of the filter, and constants of gap.py, eskf.py and aiding.py, all told by Python.
 #define RISAF_FILTER_NUMBERS(X)                                                                   \
   X(initial_bias_std) X(initial_tilt_std) X(common_noise) X(common_bias_walk) X(scale_std)        \
   X(turn_error) X(accel_bias_std) X(gate) X(gravity_distrust) X(distrust)                         \
   X(offset_std) X(delay_std)                                                                      \
+  X(GAP) X(USUAL_LESS) X(USUAL_MORE) X(SHAKEN_TIME) X(END_TIME) X(UNSEEN_CHANGE)                  \
   X(LONG_STEP) X(UNKNOWN_RATE) X(LARGEST_RATE) X(LARGEST_FORCE) X(LARGEST_STEP) X(LARGEST_GAP)    \
   X(OFFSET_TIME) X(LATE_TIME) X(RATE_SPAN) X(STEEP) X(EARTH_RATE) X(GRAVITY)                      \
   X(PART) X(SHORTEST_SPAN) X(HEAVES) X(FLOOR) X(HIDDEN_TIME) X(ANY_SPEED) X(SPEED_TIME) X(ACCELERATION_STD)        \
@@ -244,6 +245,7 @@ class Eskf {
     dt = std::min(dt, c.LARGEST_STEP);
     std::array<bool, 3> known;
     Vector held, read;
+    const Vector rate_before = rate_;
     for (std::size_t i = 0; i < 3; ++i) {
       known[i] = std::abs(fused[i].rate) < c.LARGEST_RATE;  // false for NaN
       held[i] = unseen_[i] < c.LONG_STEP ? rate_[i] : 0.0;
@@ -254,15 +256,19 @@ class Eskf {
       const double scaled = row[0] * read[0] + row[1] * read[1] + row[2] * read[2];
       rate_[i] = known[i] ? read[i] - scaled : held[i];
     }
-    const Vector unseen = see(known, dt);
+    const Step step = take(rate_before, known, dt);
+    const Vector unseen = see(known, dt, step.has_gap);
     const Quaternion before = by_rate_;
-    by_rate_ = unit(product(before, exp(rotation(dt))));
-    drive_ib_ = drive(matrix(between(before, by_rate_, 0.5)), rate_);
+    by_rate_ = unit(product(before, exp(rotation(step))));
+    drive_ib_ = drive(matrix(between(before, by_rate_, 0.5)), step.rate_b);
     const Vector earth = earth_rate();
     turn({-earth[0] * dt, -earth[1] * dt, -earth[2] * dt});
     elapsed_ += dt;
     remember();
-    spread(matrix_ni() * drive_ib_, fused, unseen, dt);
+    spread(matrix_ni() * drive_ib_, fused, unseen, step.told, dt);
+    if (step.has_gap) {
+      spread_gap(step.unseen);
+    }
   }
 
   // Whether a heading can be compared; if so, with what outcome.
@@ -393,6 +399,13 @@ class Eskf {
   }
 
  private:
+  // `Step` of gap.py, and whether it has a gap.
+  struct Step {
+    Vector rate_b;
+    double told;
+    Vector unseen;
+    bool has_gap;
+  };
   struct Instant {
     double time;
     Quaternion by_rate;
@@ -418,19 +431,50 @@ class Eskf {
     return column;
   }
 
-  Vector rotation(double dt) {
-    const Vector now{rate_[0] * dt, rate_[1] * dt, rate_[2] * dt};
-    const Vector last = dt < c.LONG_STEP ? turned_ : Vector{};
+  // `Gaps.take` of gap.py.
+  Step take(const Vector& before_b, const std::array<bool, 3>& known, double dt) {
+    const double usual = usual_ > 0.0 ? usual_ : dt;
+    usual_ = usual * (dt > usual ? c.USUAL_MORE : c.USUAL_LESS);
+    Step step{rate_, dt, {}, false};
+    if (!(dt > c.GAP * usual)) {
+      const double weight = dt / (dt + c.SHAKEN_TIME);
+      for (std::size_t i = 0; i < 3; ++i) {
+        if (known[i]) {
+          const double change = rate_[i] - before_b[i];
+          shaken_[i] += weight * (change * change / dt - shaken_[i]);
+        }
+      }
+      return step;
+    }
+    const double gap = dt - usual, bridged = std::min(gap, 2.0 * c.END_TIME);
+    step.told = dt - gap + bridged;
+    const double decided = c.UNSEEN_CHANGE * gap * gap;
+    for (std::size_t i = 0; i < 3; ++i) {
+      step.rate_b[i] += (before_b[i] - rate_[i]) * (0.5 * bridged / step.told);
+      if (known[i]) {
+        step.unseen[i] = shaken_[i] * (gap * gap * gap) / 12.0 + decided * decided;
+        step.has_gap = true;
+      }
+    }
+    return step;
+  }
+
+  Vector rotation(const Step& step) {
+    const Vector now{step.rate_b[0] * step.told, step.rate_b[1] * step.told,
+                     step.rate_b[2] * step.told};
+    const bool follows = !(in_gap_ || step.has_gap) && step.told < c.LONG_STEP;
+    const Vector last = follows ? turned_ : Vector{};
     turned_ = now;
+    in_gap_ = step.has_gap;
     return {now[0] + (last[1] * now[2] - last[2] * now[1]) / 12.0,
             now[1] + (last[2] * now[0] - last[0] * now[2]) / 12.0,
             now[2] + (last[0] * now[1] - last[1] * now[0]) / 12.0};
   }
 
-  Vector see(const std::array<bool, 3>& known, double dt) {
+  Vector see(const std::array<bool, 3>& known, double dt, bool has_gap) {
     Vector variance{};
     for (std::size_t i = 0; i < 3; ++i) {
-      if (!known[i] || dt > c.LONG_STEP) {
+      if (!known[i] || (dt > c.LONG_STEP && !has_gap)) {
         const double before = unseen_turn(unseen_[i]), after = unseen_turn(unseen_[i] + dt);
         variance[i] = after * after - before * before;
         unseen_[i] += dt;
@@ -444,11 +488,38 @@ class Eskf {
     return c.UNKNOWN_RATE * time * std::min(time / c.LONG_STEP, 1.0);
   }
 
-  void spread(const ByErrors& drive_nb, const FusedAxis* fused, const Vector& unseen, double dt) {
+  // What was turned in a gap; a level vehicle stays level.
+  void spread_gap(const Vector& unseen) {
+    const Matrix matrix_nb = matrix(attitude());
+    const double most = 2.0 * c.initial_tilt_std * c.initial_tilt_std;
+    Matrix turned{};
+    Vector scale{1.0, 1.0, 1.0};
+    for (std::size_t i = 0; i < 3; ++i) {
+      for (std::size_t j = 0; j < 3; ++j) {
+        for (std::size_t k = 0; k < 3; ++k) {
+          turned[i][j] += matrix_nb[i][k] * unseen[k] * matrix_nb[j][k];
+        }
+      }
+    }
+    for (std::size_t i = 0; i < DOWN; ++i) {
+      if (turned[i][i] > most) {
+        scale[i] = std::sqrt(most / turned[i][i]);
+      }
+    }
+    for (std::size_t i = 0; i < 3; ++i) {
+      for (std::size_t j = 0; j < 3; ++j) {
+        covariance_[i][j] += (turned[i][j] + turned[j][i]) / 2.0 * (scale[i] * scale[j]);
+      }
+    }
+    bound();
+  }
+
+  void spread(const ByErrors& drive_nb, const FusedAxis* fused, const Vector& unseen, double told,
+              double dt) {
     ByErrors turned_nb;
     for (std::size_t i = 0; i < 3; ++i) {
       for (std::size_t j = 0; j < ERRORS; ++j) {
-        turned_nb[i][j] = drive_nb[i][j] * dt;
+        turned_nb[i][j] = drive_nb[i][j] * told;
       }
     }
     for (std::size_t i = 0; i < 3; ++i) {
@@ -461,7 +532,7 @@ class Eskf {
         }
       }
     }
-    const auto [angle, walk] = noise(fused, unseen, dt);
+    const auto [angle, walk] = noise(fused, unseen, told, dt);
     Matrix among;
     for (std::size_t i = 0; i < 3; ++i) {
       for (std::size_t j = 0; j < 3; ++j) {
@@ -511,16 +582,17 @@ class Eskf {
     }
   }
 
-  std::pair<Vector, Vector> noise(const FusedAxis* fused, const Vector& unseen, double dt) const {
+  std::pair<Vector, Vector> noise(const FusedAxis* fused, const Vector& unseen, double told,
+                                  double dt) const {
     const double common = c.common_noise * c.common_noise * dt +
                           c.turn_error * c.turn_error * std::sqrt(dot(turned_, turned_));
     Vector angle, walk;
     for (std::size_t i = 0; i < 3; ++i) {
       const double noise = fused[i].noise, bias_walk = fused[i].bias_walk;
       const bool known = 0.0 <= noise && noise < c.LARGEST_RATE * c.LARGEST_RATE;
-      const bool told = 0.0 <= bias_walk && bias_walk < c.LARGEST_RATE;
-      angle[i] = (known ? noise * dt * dt : 0.0) + common + unseen[i];
-      walk[i] = ((told ? bias_walk * bias_walk : 0.0) + c.common_bias_walk * c.common_bias_walk) * dt;
+      const bool walks = 0.0 <= bias_walk && bias_walk < c.LARGEST_RATE;
+      angle[i] = (known ? noise * told * told : 0.0) + common + unseen[i];
+      walk[i] = ((walks ? bias_walk * bias_walk : 0.0) + c.common_bias_walk * c.common_bias_walk) * dt;
     }
     return {angle, walk};
   }
@@ -783,7 +855,9 @@ class Eskf {
 
   FilterNumbers c;
   Quaternion by_rate_, correction_;
-  Vector bias_{}, rate_{}, unseen_{}, turned_{};
+  Vector bias_{}, rate_{}, unseen_{}, turned_{}, shaken_{};
+  double usual_ = 0.0;
+  bool in_gap_ = false;
   std::array<double, 9> scale_{};
   Errors force_errors_{};
   ByErrors drive_ib_{};
