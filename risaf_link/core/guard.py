@@ -13,6 +13,7 @@ that is right. So the headings are judged together.
   is to say if they are all off by the same angle, and if they do so for as long as yaw was
   confirmed before: ten seconds of headings do not outweigh minutes.
 - The course of a vehicle in reverse is turned round.
+- Near a pole, where north turns with the way, yaw is not claimed to be known.
 """
 
 import math
@@ -231,6 +232,8 @@ class HeadingGuard:
         """Use what one fix says; None: it says nothing of heading."""
         self._catch_up()
         self._hear(motion)
+        if motion.polar:
+            self._whiteness.doubt = math.pi
         if motion.heading is None:
             return None
         pause = self._elapsed - self._last

@@ -33,9 +33,10 @@ A channel is on the jury if it is valid and trusted; r_i is its reading less its
 
 If less than half of the valid channels, or less than three, are trusted, all that change are the
 jury; it is active itself only where none of the trusted is inside. If none of an axis changes,
-there is no rate of it: an array that repeats itself says nothing. One or two sensors have no majority: their mean is taken, and neither is blamed but for
-silence or a reading that does not change. Of few sensors, scale factors and misalignments that are
-usual are no reason for blame (`scale_error`): they do not show themselves how far they differ.
+there is no rate of it: an array that repeats itself says nothing. One or two sensors have no
+majority: their mean is taken, and neither is blamed but for silence or a reading that does not
+change. Of few sensors, scale factors and misalignments that are usual are no reason for blame
+(`scale_error`): they do not show themselves how far they differ.
 
 How certain the rate is
 -----------------------
