@@ -13,6 +13,7 @@ from risaf_link.core.health import Reason, SensorState
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.notices import Notices
 from risaf_link.sim.drive import Drive
+from risaf_link.sim.faults import FAULTS
 from risaf_link.sim.stream import frames
 from risaf_link.sim.trajectory import Place
 
@@ -70,6 +71,17 @@ def test_a_whole_array_that_freezes_is_not_believed(gps, length):
         assert outcome.std[-1] < 0.02
     else:
         assert outcome.std[-1] > 1.0
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_sensors_that_fail_alone_cost_no_honesty(name):
+    """GPS goes with them: nothing else tells what they do to yaw."""
+    fault = FAULTS[name]
+    if hasattr(fault, "onset"):
+        fault = replace(fault, onset=(FAULT - 5.0, FAULT + 5.0))
+    if hasattr(fault, "share"):
+        fault = replace(fault, share=max(fault.share, 1 / SENSORS))
+    assert run(drive(gps=False, faults={name: fault})).worst < HONEST
 
 
 @WITH_GPS

@@ -207,7 +207,7 @@ class Robust:
         jury = _jury(trusted, changing, valid)
 
         corrected = np.where(valid, raw - self._channels.bias, 0.0)
-        is_heard = jury.any(axis=1, keepdims=True)
+        is_heard: Bools = np.logical_or.reduce(jury, axis=1, keepdims=True)
         centre = np.where(is_heard, _median(corrected, jury), self._centre)
         offset = corrected - centre
         distance = np.abs(offset)
