@@ -239,6 +239,8 @@ class Service:
         table = self._parser(*sender).receive_table(data)
         self._gibberish.note(sender[0], len(table))
         table = self._accepted(table, sender[0])
+        if not len(table):  # garbage costs no more than that
+            return
         self._frames += len(table)
         self._frames_in[sender[0]] += len(table)
         self._record(table, received_us)
