@@ -73,6 +73,16 @@ def test_a_whole_array_that_freezes_is_not_believed(gps, length):
         assert outcome.std[-1] > 1.0
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_gyro_that_is_alone_and_freezes_on_the_move_is_not_believed(seed):
+    fault = AllFrozen(FAULT, FAULT + 10.0)
+    outcome = run(drive(seed, duration=75.0, sensors=1, faults={"frozen": fault}))
+    frozen = (outcome.time_s > FAULT + 2.0) & (outcome.time_s < FAULT + 10.0)
+    assert outcome.std[frozen].min() > 2.5
+    assert outcome.worst < HONEST
+    assert outcome.std[-1] < 0.02
+
+
 @pytest.mark.parametrize("name", FAULTS)
 def test_sensors_that_fail_alone_cost_no_honesty(name):
     """GPS goes with them: nothing else tells what they do to yaw."""

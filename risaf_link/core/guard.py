@@ -13,6 +13,8 @@ that is right. So the headings are judged together.
   is to say if they are all off by the same angle, and if they do so for as long as yaw was
   confirmed before: ten seconds of headings do not outweigh minutes.
 - The course of a vehicle in reverse is turned round.
+- A single gyro that repeats its reading while GPS tells of motion is frozen: yaw is not known. Where
+  there are more, the fusion finds out by itself.
 - Near a pole, where north turns with the way, yaw is not claimed to be known.
 """
 
@@ -28,7 +30,7 @@ from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
 from risaf_link.core.heading import HeadingParameters, HeadingSource, Motion
 from risaf_link.core.rotation import Floats, wrap, wraps
-from risaf_link.core.track import Track
+from risaf_link.core.track import FUSED, VALID, Track
 
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
 MEMORY = 15  # innovations in a mean
@@ -38,6 +40,7 @@ MEAN_TRUST = 2.5  # and within which they are trusted again
 LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
 AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
+FROZEN_AFTER = 1.0  # s of one reading on the move: filtered counts may stand still on calm water
 RATES = 1024  # epochs; a second at 1 kHz
 ROOM = 4 * RATES  # so that room has to be made only now and then
 RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
@@ -172,6 +175,8 @@ class HeadingGuard:
         self._aligned = False
         self._confirmed = 0.0  # s for which headings have agreed with yaw
         self._is_hearsay = False  # yaw is remembered, and no heading has agreed with it since
+        self._reading = np.full((1, 3), math.nan)  # the last one of a gyro that is alone
+        self._changed = 0.0  # s, when it was another
 
     def configure(self, parameters: HeadingParameters) -> None:
         """Take new parameters; what was learnt stays."""
@@ -206,9 +211,19 @@ class HeadingGuard:
             elapsed, dt = np.concatenate(times), np.concatenate(steps)
         self._unread, self._unread_epochs = [], 0
         self._turn(track.rate_b, elapsed, dt)
+        self._note_readings(track.values, elapsed)
         self.gear.feel(track.ahead, dt)
         self._elapsed = float(elapsed[-1])
         self._aligned = bool(track.aligned[-1])
+
+    def _note_readings(self, values: Floats, elapsed: Floats) -> None:
+        """Take note of when a gyro that is alone read something else."""
+        alone = np.where(values[:, VALID, np.newaxis] == 1, values[:, FUSED], math.nan)
+        readings = np.concatenate((self._reading, alone))
+        changed = np.flatnonzero((readings[1:] != readings[:-1]).any(axis=1))  # so does NaN
+        if len(changed):
+            self._changed = float(elapsed[changed[-1]])
+        self._reading = readings[-1:]
 
     def _turn(self, rate_b: Floats, elapsed: Floats, dt: Floats) -> None:
         """Go on with the rate's integral."""
@@ -232,8 +247,10 @@ class HeadingGuard:
         """Use what one fix says; None: it says nothing of heading."""
         self._catch_up()
         self._hear(motion)
-        if motion.polar:
+        moves = motion.speed > self._parameters.min_speed  # false for NaN
+        if motion.polar or (moves and self._elapsed - self._changed > FROZEN_AFTER):
             self._whiteness.doubt = math.pi
+            self._confirmed = 0.0
         if motion.heading is None:
             return None
         pause = self._elapsed - self._last
