@@ -447,7 +447,7 @@ class Eskf:
         matrix_nb = drive_nb[:, 0:3]
         turned_nb = drive_nb * dt
         covariance = self._covariance
-        before = covariance.diagonal()[ATTITUDE].copy()
+        before = covariance.diagonal()[LEVEL].copy()
         covariance[ATTITUDE] -= turned_nb @ covariance[GYRO]
         among = covariance[ATTITUDE, ATTITUDE] - covariance[ATTITUDE, GYRO] @ turned_nb.T
         among += (matrix_nb * angle) @ matrix_nb.T
@@ -460,7 +460,9 @@ class Eskf:
         covariance[LATE, OFFSET] = covariance[OFFSET, LATE]  # rounded in another order
         covariance[HEADING_AXES, HEADING_AXES] += self._wrong_variance * (1.0 - kept * kept)
         covariance[BIAS_AXES, BIAS_AXES] += walk
-        self._bound(before, bool(unseen.any()))
+        if unseen.any():
+            self._keep_level(before)
+        self._bound()
 
     def _noise(
         self, fused: FusedRate, unseen: Floats, dt: float
@@ -477,30 +479,31 @@ class Eskf:
             walk.append(((bias_walk**2 if told else 0.0) + p.common_bias_walk**2) * dt)
         return angle, walk
 
-    def _bound(self, before: Floats, unseen: bool) -> None:
-        """Let no angle be less known than not at all: pi. Scaling keeps the matrix positive.
+    def _bound(self) -> None:
+        """Let no angle be less known than not at all: pi. Scaling keeps the matrix positive."""
+        covariance = self._covariance
+        if max(covariance[0, 0], covariance[1, 1], covariance[2, 2]) > math.pi**2:
+            scale = np.ones(STATES)
+            scale[ATTITUDE] = np.minimum(math.pi / np.sqrt(covariance.diagonal()[ATTITUDE]), 1.0)
+            self._covariance = covariance * np.outer(scale, scale)
 
-        What was not seen makes a tilt no less known than that of a vehicle within
-        `initial_tilt_std` of level, of which the estimate may be off as much: beyond that a filter
-        that is linear would take headings for news of the tilt.
+    def _keep_level(self, before: Floats) -> None:
+        """Let what was not seen make the tilt no less known than that of a level vehicle.
+
+        It is within `initial_tilt_std` of level, and the estimate may be off as much. Beyond that a
+        filter that is linear would take headings for news of the tilt.
 
         Parameters
         ----------
-        before : ndarray, shape (3,)
-            Variances of the angles before this step, rad^2.
-        unseen : bool
-            Whether a rate was not known.
+        before : ndarray, shape (2,)
+            Variances of the tilt before the step, rad^2.
         """
-        most = np.full(3, math.pi**2)
-        if unseen:
-            level = 2.0 * self._parameters.initial_tilt_std**2
-            level += 1.0 - min(max(float(self.matrix[2, 2]), 0.0), 1.0) ** 2
-            most[LEVEL] = np.minimum(np.maximum(before[LEVEL], level), math.pi**2)
-        known = self._covariance.diagonal()[ATTITUDE]
-        if (known > most).any():
-            scale = np.ones(STATES)
-            scale[ATTITUDE] = np.minimum(np.sqrt(most / known), 1.0)
-            self._covariance = self._covariance * np.outer(scale, scale)
+        level = 2.0 * self._parameters.initial_tilt_std**2
+        level += 1.0 - min(max(float(self.matrix[2, 2]), 0.0), 1.0) ** 2
+        known = self._covariance.diagonal()[LEVEL]
+        scale = np.ones(STATES)
+        scale[LEVEL] = np.minimum(np.sqrt(np.maximum(before, level) / known), 1.0)
+        self._covariance = self._covariance * np.outer(scale, scale)
 
     def _earth_rate(self) -> Vector:
         """Rate of the earth, rad/s, NED; its horizontal part only where north is known."""

@@ -13,8 +13,8 @@ that is right. So the headings are judged together.
   is to say if they are all off by the same angle, and if they do so for as long as yaw was
   confirmed before: ten seconds of headings do not outweigh minutes.
 - The course of a vehicle in reverse is turned round.
-- A single gyro that repeats its reading while GPS tells of motion is frozen: yaw is not known. Where
-  there are more, the fusion finds out by itself.
+- A gyro that is alone and repeats its reading while GPS tells of motion is frozen: yaw is unknown.
+  Where there are more, the fusion finds out by itself.
 - Near a pole, where north turns with the way, yaw is not claimed to be known.
 """
 

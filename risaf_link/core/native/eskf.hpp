@@ -445,7 +445,7 @@ class Eskf {
   }
 
   void spread(const ByErrors& drive_nb, const FusedAxis* fused, const Vector& unseen, double dt) {
-    const Vector before{covariance_[0][0], covariance_[1][1], covariance_[2][2]};
+    const std::array<double, 2> before{covariance_[0][0], covariance_[1][1]};
     ByErrors turned_nb;
     for (std::size_t i = 0; i < 3; ++i) {
       for (std::size_t j = 0; j < ERRORS; ++j) {
@@ -490,7 +490,10 @@ class Eskf {
     for (std::size_t i = 0; i < 3; ++i) {
       covariance_[BIAS + i][BIAS + i] += walk[i];
     }
-    bound(before, unseen[0] + unseen[1] + unseen[2] > 0.0);
+    if (unseen[0] + unseen[1] + unseen[2] > 0.0) {
+      keep_level(before);
+    }
+    bound();
   }
 
   // What is wrong with the headings becomes another.
@@ -526,23 +529,29 @@ class Eskf {
     return {angle, walk};
   }
 
-  void bound(const Vector& before, bool unseen) {
-    Vector most{PI * PI, PI * PI, PI * PI};
-    if (unseen) {
-      const double down = std::clamp(matrix(attitude())[2][2], 0.0, 1.0);
-      const double level = 2.0 * c.initial_tilt_std * c.initial_tilt_std + 1.0 - down * down;
-      for (std::size_t i = 0; i < 2; ++i) {
-        most[i] = std::min(std::max(before[i], level), PI * PI);
-      }
-    }
-    if (covariance_[0][0] <= most[0] && covariance_[1][1] <= most[1] &&
-        covariance_[2][2] <= most[2]) {
+  void bound() {
+    if (std::max({covariance_[0][0], covariance_[1][1], covariance_[2][2]}) <= PI * PI) {
       return;
     }
     State scale;
     scale.fill(1.0);
     for (std::size_t i = 0; i < 3; ++i) {
-      scale[i] = std::min(std::sqrt(most[i] / covariance_[i][i]), 1.0);
+      scale[i] = std::min(PI / std::sqrt(covariance_[i][i]), 1.0);
+    }
+    for (std::size_t i = 0; i < STATES; ++i) {
+      for (std::size_t j = 0; j < STATES; ++j) {
+        covariance_[i][j] *= scale[i] * scale[j];
+      }
+    }
+  }
+
+  void keep_level(const std::array<double, 2>& before) {
+    const double down = std::clamp(matrix(attitude())[2][2], 0.0, 1.0);
+    const double level = 2.0 * c.initial_tilt_std * c.initial_tilt_std + 1.0 - down * down;
+    State scale;
+    scale.fill(1.0);
+    for (std::size_t i = 0; i < 2; ++i) {
+      scale[i] = std::min(std::sqrt(std::max(before[i], level) / covariance_[i][i]), 1.0);
     }
     for (std::size_t i = 0; i < STATES; ++i) {
       for (std::size_t j = 0; j < STATES; ++j) {
