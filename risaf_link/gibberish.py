@@ -45,6 +45,7 @@ class Gibberish:
                 notices.append(Notice(Severity.INFO, f"{link}: MAVLink comes"))
             elif not frames[link] and came >= LEAST_BYTES and link not in self._told:
                 self._told.add(link)
-                text = f"{link}: what comes is no MAVLink: wrong baud rate?"
-                notices.append(Notice(Severity.WARNING, text))
+                notices.append(
+                    Notice(Severity.WARNING, f"{link}: what comes is no MAVLink: wrong baud rate?")
+                )
         return notices

@@ -464,7 +464,7 @@ class Service:
             await asyncio.sleep(TICK_S)
             late_s = loop.time() - now_us / 1e6 - TICK_S
             if late_s > STALLED_S:
-                _log.warning("stood still for %.1f s", late_s)
+                _log.warning("stood still for %d s", round(late_s))
 
 
 def _pace(link: Link) -> float:
