@@ -213,7 +213,9 @@ class Replay:
             log_time = (times_us.astype(np.int64) - first_us) / 1e6
             late = log_time > self._selection.end
             until = int(late.argmax()) if late.any() else len(table)
-            chosen = log_time[:until] >= self._selection.start
+            # Behind a clock that was set back, what came later is from before the first record.
+            start = self._selection.start or -math.inf
+            chosen = log_time[:until] >= start
             if chosen.any():
                 self._frames += int(np.count_nonzero(chosen))
                 yield FrameTable(table.buffer, table.cuts[:until][chosen]), times_us[:until][chosen]

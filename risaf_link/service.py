@@ -15,6 +15,7 @@ from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.kernel import BUILT
 from risaf_link.gate import Gate
+from risaf_link.gibberish import Gibberish
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.keys import open_keys
 from risaf_link.links import Link, TlogLink, Worth, open_link
@@ -40,6 +41,7 @@ OPENING = 20  # looks at whether the links are open, in the first TICK_S
 MOST_PEERS = 256  # of all links together
 PARAM_VALUE_BYTES = 37  # of a PARAM_VALUE frame
 PARAMETERS_SHARE = 0.4  # of a link, that a list of parameters takes at most
+STALLED_S = 1.0  # later than due: others have had the processor, or the machine was halted
 
 _log = logging.getLogger(__name__)
 
@@ -114,6 +116,7 @@ class Service:
             self.pipeline.ingest, self.pipeline.assembler, apart=HEARD, longest=1
         )
         self._held = Held()
+        self._gibberish = Gibberish()
         self._holding: Peer = ("", "")  # whose datagrams wait
         self._frames = 0
         self._received_us = 0
@@ -190,7 +193,10 @@ class Service:
         self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
         self._keys.advance(received_us)
         cut = self._parser(*sender).receive_table(data)
+        self._gibberish.note(sender[0], len(cut))
         table = self._gate.admitted(cut, sender, received_us)
+        if not len(table):  # garbage costs no more than that
+            return Worth.NOTHING
         self._frames += len(table)
         self._frames_in[sender[0]] += len(table)
         self._record(table, received_us)
@@ -309,6 +315,14 @@ class Service:
         severity = Severity.WARNING if ignored else Severity.INFO
         self._component.tell(Notice(severity, self._recalled))
 
+    def _tell_gibberish(self, now_s: float) -> None:
+        """Tell which links bring bytes and no MAVLink."""
+        bytes_in = {link.name: link.counts.bytes_in for link in self.links}
+        for notice in self._gibberish.look(bytes_in, now_s):
+            level = logging.WARNING if notice.severity < Severity.INFO else logging.INFO
+            _log.log(level, "%s", notice.text)
+            self._component.tell(notice)
+
     async def _beat(self) -> None:
         """Do what is due by time; HEARTBEAT follows the estimator's progress.
 
@@ -323,6 +337,7 @@ class Service:
             self._take_held()
             self._look_after_keys(loop.time())
             self._look_after_state(loop.time())
+            self._tell_gibberish(loop.time())
             now_us = round(loop.time() * 1e6)
             gathered = self.pipeline.assembler.counts["epochs"]
             is_alive = self._component.note_gathered(gathered, now_us)
@@ -332,6 +347,9 @@ class Service:
             self._hand_out(self._component.collect(self._peers()))
             self._supervisor.tell(loop.time(), lambda: self._component.status, is_alive)
             await asyncio.sleep(TICK_S)
+            late_s = loop.time() - now_us / 1e6 - TICK_S
+            if late_s > STALLED_S:
+                _log.warning("stood still for %d s", round(late_s))
 
 
 def _pace(link: Link) -> float:

@@ -15,7 +15,7 @@ LAYERS = [
     {"links", "publish", "sim"},
     {"config", "sweep"},
     {"kept"},
-    {"keys", "remembered", "supervisor", "install"},
+    {"keys", "remembered", "supervisor", "install", "gibberish"},
     {"gate"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench", "demo"},

@@ -212,13 +212,22 @@ def test_the_stated_bias_walk_is_that_of_the_fused_bias():
     assert 30.8 / 48 < np.mean(squares) < 69.0 / 48  # 48 draws of chi-square
 
 
-def test_everything_at_once_frozen_is_flagged_and_no_reason_to_stop():
-    drive = Drive(10, 12.0)
-    drive.readings[drive.at(10) :] = drive.readings[drive.at(10)]
-    results, fusion = drive.fused()
+@pytest.mark.parametrize("sensors", [2, 10])
+def test_an_array_that_repeats_itself_says_nothing_until_it_goes_on(sensors):
+    drive = Drive(sensors, 15.0)
+    frozen = slice(drive.at(10), drive.at(12))
+    drive.readings[frozen] = drive.readings[drive.at(10)]
+    _, fusion = fuse(drive.readings[: drive.at(12)])
     assert (fusion.health().state == SensorState.DEAD).all()
     assert (fusion.health().reason == Reason.FROZEN).all()
-    assert np.isfinite(rates(results)).all()
+    results, _ = drive.fused()
+    is_known = np.isfinite(rates(results)).all(axis=1)
+    assert not is_known[drive.at(10.1) : drive.at(12)].any()
+    assert is_known[: drive.at(10)].all()
+    assert is_known[drive.at(12) :].all()
+    error = rates(results) - drive.truth - drive.bias.mean(axis=1)
+    before, after = error[drive.at(8) : drive.at(10)], error[drive.at(12) :]
+    assert np.abs(after.mean(axis=0) - before.mean(axis=0)).max() < 0.2 * BIAS
 
 
 def test_counts_that_are_coarser_than_the_noise_do_not_look_frozen_at_rest():

@@ -262,7 +262,7 @@ class Eskf:
         rate_before, self._rate = self._rate, np.where(known, read - self._scale @ read, held)
         step = self._gaps.take(rate_before, self._rate, known, dt)
         has_gap = bool(step.unseen.any())
-        unseen = self._see(known, dt, has_gap)
+        unseen = self._see(known, dt, has_gap) + step.unseen
         before = self._by_rate
         self._by_rate = quaternion.unit(
             quaternion.product(before, quaternion.exp(self._rotation(step, has_gap)))
@@ -275,8 +275,6 @@ class Eskf:
         self._elapsed += dt
         self._history.append((self._elapsed, self._by_rate))
         self._spread(self.matrix_ni @ self._drive_ib, fused, unseen, step.told, dt)
-        if has_gap:
-            self._spread_gap(step.unseen)
 
     def compare_heading(
         self, heading: float, variance: float, age: float, gate: float
@@ -458,6 +456,7 @@ class Eskf:
         matrix_nb = drive_nb[:, 0:3]
         turned_nb = drive_nb * told
         covariance = self._covariance
+        before = covariance.diagonal()[LEVEL].copy()
         covariance[ATTITUDE] -= turned_nb @ covariance[GYRO]
         among = covariance[ATTITUDE, ATTITUDE] - covariance[ATTITUDE, GYRO] @ turned_nb.T
         among += (matrix_nb * angle) @ matrix_nb.T
@@ -470,19 +469,8 @@ class Eskf:
         covariance[LATE, OFFSET] = covariance[OFFSET, LATE]  # rounded in another order
         covariance[HEADING_AXES, HEADING_AXES] += self._wrong_variance * (1.0 - kept * kept)
         covariance[BIAS_AXES, BIAS_AXES] += walk
-        self._bound()
-
-    def _spread_gap(self, unseen: Floats) -> None:
-        """Add the variance of what each axis turned in a gap; a level vehicle stays level."""
-        matrix_nb = self.matrix
-        turned = (matrix_nb * unseen) @ matrix_nb.T
-        most = 2.0 * self._parameters.initial_tilt_std**2
-        scale = np.ones(3)
-        for axis in (0, 1):
-            if turned[axis, axis] > most:
-                scale[axis] = math.sqrt(most / turned[axis, axis])
-        turned *= np.outer(scale, scale)
-        self._covariance[ATTITUDE, ATTITUDE] += (turned + turned.T) / 2.0
+        if unseen.any():
+            self._keep_level(before)
         self._bound()
 
     def _noise(
@@ -507,6 +495,24 @@ class Eskf:
             scale = np.ones(STATES)
             scale[ATTITUDE] = np.minimum(math.pi / np.sqrt(covariance.diagonal()[ATTITUDE]), 1.0)
             self._covariance = covariance * np.outer(scale, scale)
+
+    def _keep_level(self, before: Floats) -> None:
+        """Let what was not seen make the tilt no less known than that of a level vehicle.
+
+        It is within `initial_tilt_std` of level, and the estimate may be off as much. Beyond that a
+        filter that is linear would take headings for news of the tilt.
+
+        Parameters
+        ----------
+        before : ndarray, shape (2,)
+            Variances of the tilt before the step, rad^2.
+        """
+        level = 2.0 * self._parameters.initial_tilt_std**2
+        level += 1.0 - min(max(float(self.matrix[2, 2]), 0.0), 1.0) ** 2
+        known = self._covariance.diagonal()[LEVEL]
+        scale = np.ones(STATES)
+        scale[LEVEL] = np.minimum(np.sqrt(np.maximum(before, level) / known), 1.0)
+        self._covariance = self._covariance * np.outer(scale, scale)
 
     def _earth_rate(self) -> Vector:
         """Rate of the earth, rad/s, NED; its horizontal part only where north is known."""

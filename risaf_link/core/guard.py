@@ -15,6 +15,9 @@ that is right. So the headings are judged together.
 - The course of a vehicle in reverse is turned round.
 - A heading of before a gap in the readings, that comes after it, does not tell what the vehicle has
   turned in the gap, and is not used; nor is one that comes before the first reading.
+- A gyro that is alone and repeats its reading while GPS tells of motion is frozen: yaw is unknown.
+  Where there are more, the fusion finds out by itself.
+- Near a pole, where north turns with the way, yaw is not claimed to be known.
 """
 
 import math
@@ -29,7 +32,7 @@ from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
 from risaf_link.core.heading import Heading, HeadingParameters, HeadingSource, Motion
 from risaf_link.core.rotation import Floats, wrap, wraps
-from risaf_link.core.track import BIAS_STD, Track
+from risaf_link.core.track import BIAS_STD, FUSED, VALID, Track
 
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
 MEMORY = 15  # innovations in a mean
@@ -40,6 +43,7 @@ LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
 BIAS_GATE = 5.0  # standard deviations by which the bias may be off, for the gyros to agree
 AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
+FROZEN_AFTER = 1.0  # s of one reading on the move: filtered counts may stand still on calm water
 RATES = 1024  # epochs; a second at 1 kHz
 ROOM = 4 * RATES  # so that room has to be made only now and then
 RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
@@ -189,6 +193,8 @@ class HeadingGuard:
         self._bias_std = 0.0  # rad/s, on the axis on which it is largest
         self._confirmed = 0.0  # s for which headings have agreed with yaw
         self._is_hearsay = False  # yaw is remembered, and no heading has agreed with it since
+        self._reading = np.full((1, 3), math.nan)  # the last one of a gyro that is alone
+        self._changed = 0.0  # s, when it was another
 
     def configure(self, parameters: HeadingParameters) -> None:
         """Take new parameters; what was learnt stays."""
@@ -224,6 +230,7 @@ class HeadingGuard:
         self._unread, self._unread_epochs = [], 0
         self._note_gaps(elapsed, dt)
         self._turn(track.rate_b, elapsed, dt)
+        self._note_readings(track.values, elapsed)
         self.gear.feel(track.ahead, dt)
         self._elapsed = float(elapsed[-1])
         self._aligned = bool(track.aligned[-1])
@@ -237,6 +244,15 @@ class HeadingGuard:
         (gaps,) = np.nonzero(dt > max(SHORTEST_GAP, LONG_STEPS * self._usual))
         if len(gaps):
             self._gap_end = float(elapsed[gaps[-1]])
+
+    def _note_readings(self, values: Floats, elapsed: Floats) -> None:
+        """Take note of when a gyro that is alone read something else."""
+        alone = np.where(values[:, VALID, np.newaxis] == 1, values[:, FUSED], math.nan)
+        readings = np.concatenate((self._reading, alone))
+        changed = np.flatnonzero((readings[1:] != readings[:-1]).any(axis=1))  # so does NaN
+        if len(changed):
+            self._changed = float(elapsed[changed[-1]])
+        self._reading = readings[-1:]
 
     def _turn(self, rate_b: Floats, elapsed: Floats, dt: Floats) -> None:
         """Go on with the rate's integral."""
@@ -260,6 +276,10 @@ class HeadingGuard:
         """Use what one fix says; None: it says nothing of heading."""
         self._catch_up()
         self._hear(motion)
+        moves = motion.speed > self._parameters.min_speed  # false for NaN
+        if motion.polar or (moves and self._elapsed - self._changed > FROZEN_AFTER):
+            self._whiteness.doubt = math.pi
+            self._confirmed = 0.0
         if motion.heading is None or not self._tells_of_now(motion.heading):
             return None
         pause = self._elapsed - self._last

@@ -32,6 +32,7 @@ RESOLUTION = 1e-3  # rad, of a course or yaw
 WITNESS_TIME = 5.0  # s for which velocity is added up and held against positions
 WITNESS_GATE = 4.0  # standard deviations of a position
 WITNESS_SHARE = 0.2  # of the way: the course is filtered, and later or earlier than the position
+POLAR_CAP = math.radians(88.0)  # beyond, 30 m/s along a parallel turn north by 0.5 deg a minute
 ANTENNA_PATIENCE = 10.0  # s for which two antennas that have no yaw now are waited for
 
 
@@ -123,6 +124,7 @@ class Motion:
     along: bool = True  # the vehicle goes where it points, or backwards
     is_news: bool = field(default=True, compare=False)  # it differs from the fix before
     contradicted: bool = False  # by the receiver's own positions
+    polar: bool = False  # so near to a pole that north does not stay where it is
 
 
 class PositionWitness:
@@ -182,7 +184,7 @@ class HeadingFinder:
     allows; antennas that had a yaw, or say that they can, are waited for. All but the antennas need
     a vehicle whose course is its heading, and `min_speed`: for positions it is the speed between
     the two points, section III.A. A direction between two points is the course half-way between
-    them.
+    them. Beyond `POLAR_CAP` no fix says a heading.
     """
 
     def __init__(self, parameters: HeadingParameters) -> None:
@@ -209,14 +211,17 @@ class HeadingFinder:
         previous = self._previous[0] if self._previous else None
         track = self._track(fix, time_s)
         by_track = self._parameters.source.startswith("positions") or math.isnan(fix.speed)
+        polar = abs(fix.latitude) > POLAR_CAP
+        heading = self._choose(fix, track, time_s)
         return Motion(
             track.speed if by_track else fix.speed,
-            self._choose(fix, track, time_s),
+            None if polar else heading,
             track.speed_std if by_track else _known(fix.speed_std, UNKNOWN_SPEED_STD),
             fix.course if fix.speed >= self._parameters.min_speed else math.nan,
             self._goes_ahead(fix),
             previous is None or _content(fix) != _content(previous),
             self._witness.contradicts(fix, time_s),
+            polar,
         )
 
     def _goes_ahead(self, fix: GpsFix) -> bool:

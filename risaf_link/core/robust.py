@@ -32,10 +32,11 @@ A channel is on the jury if it is valid and trusted; r_i is its reading less its
    does: from all of its readings, without a say in the rate.
 
 If less than half of the valid channels, or less than three, are trusted, all that change are the
-jury, or if none does, all that are valid; it is active itself only where none of the trusted is
-inside. One or two sensors have no majority: their mean is taken, and neither is blamed but for
-silence or a reading that does not change. Of few sensors, scale factors and misalignments that are
-usual are no reason for blame (`scale_error`): they do not show themselves how far they differ.
+jury; it is active itself only where none of the trusted is inside. If none of an axis changes,
+there is no rate of it: an array that repeats itself says nothing. One or two sensors have no
+majority: their mean is taken, and neither is blamed but for silence or a reading that does not
+change. Of few sensors, scale factors and misalignments that are usual are no reason for blame
+(`scale_error`): they do not show themselves how far they differ.
 
 How certain the rate is
 -----------------------
@@ -75,6 +76,8 @@ SWELL = 3.0  # times the spread of late: what the spread of an epoch may be, if 
 NOISE_TIME = 2.0  # s, of averaging the noise: vibration comes and goes in seconds
 SPREAD_TIME = 30.0  # s, of averaging the spread of z: ten times its low pass
 FROZEN_AFTER = 0.5  # s; at a noise of one count, 50 equal readings have a chance of 1e-27
+REPEATED_AFTER = 0.05  # s; at least an epoch, for which all of an array repeat themselves
+MANY = 6  # channels; noisier than half a count, all of them repeat themselves once in 250 epochs
 RELEARN = 30.0  # s; bursts are over by then
 DEAD_AFTER = 60.0  # s without trust: it did not come back when it had learnt anew
 TINY = 1e-9  # s
@@ -204,11 +207,12 @@ class Robust:
         jury = _jury(trusted, changing, valid)
 
         corrected = np.where(valid, raw - self._channels.bias, 0.0)
-        centre = _median(corrected, jury)
+        is_heard: Bools = np.logical_or.reduce(jury, axis=1, keepdims=True)
+        centre = np.where(is_heard, _median(corrected, jury), self._centre)
         offset = corrected - centre
         distance = np.abs(offset)
         self._note_turning(centre, dt)
-        inside = (distance <= self._limit(distance, jury, centre, dt)) & valid
+        inside = (distance <= self._limit(distance, jury, is_heard, centre, dt)) & valid
         active = trusted & inside
         count = active.sum(axis=1)
         if not count.all():  # where none of the trusted is inside, the rest of the jury
@@ -239,7 +243,8 @@ class Robust:
 
         Frozen is what does not change although there was reason to: the array has moved by two
         counts since, or its noise is more than half a count (rounding alone makes 0.29). What no
-        noise and no motion makes change, such as coarse counts at rest, is not frozen.
+        noise and no motion makes change, such as coarse counts at rest, is not frozen. Where all
+        repeat themselves at once, and enough of them by their noise should not, all are frozen.
         """
         c = self._channels
         change = np.abs(readings - c.reading)
@@ -251,8 +256,11 @@ class Robust:
         c.silent *= ~valid
         c.reading = np.where(valid, readings, c.reading)
         count = np.fmax(c.count, self._parameters.resolution)
-        reason = (np.abs(c.moved) > 2.0 * count) | (2.0 * self._jitter > count) | (c.frozen > 0.0)
+        noisy = 2.0 * self._jitter > count
+        reason = (np.abs(c.moved) > 2.0 * count) | noisy | (c.frozen > 0.0)
         c.frozen[:] = valid & (c.unchanged > FROZEN_AFTER) & reason
+        if (c.unchanged > REPEATED_AFTER)[valid].all() and (noisy & valid).sum() >= MANY:
+            c.frozen[:] = valid
         changing: Bools = valid & (c.frozen == 0.0)
         return changing
 
@@ -272,7 +280,9 @@ class Robust:
         believed = PRIOR / (PRIOR + self._trusted.shape[1])
         return self._parameters.scale_error * math.sqrt(believed * float((rate**2).sum()))
 
-    def _limit(self, distance: Floats, jury: Bools, centre: Floats, dt: float) -> Floats:
+    def _limit(
+        self, distance: Floats, jury: Bools, is_heard: Bools, centre: Floats, dt: float
+    ) -> Floats:
         """How far from the centre of the jury a reading is inside; shape (3, 1)."""
         p = self._parameters
         least = math.hypot(p.resolution, self._unscaled(centre))
@@ -280,7 +290,7 @@ class Robust:
         spread = _deviation(distance, jury)
         if self._elapsed > 0:
             spread = np.minimum(spread, SWELL * usual)
-        self._spread += self._share(dt, NOISE_TIME) * (spread - self._spread)
+        self._spread += is_heard * self._share(dt, NOISE_TIME) * (spread - self._spread)
         nearest = np.where(jury, distance, np.inf).min(axis=1, initial=np.inf, keepdims=True)
         widest = np.maximum(np.maximum(spread, self._spread), least)
         limit: Floats = np.maximum(p.gate * widest, nearest)
@@ -299,7 +309,8 @@ class Robust:
         change = residual - c.residual
         c.residual = residual
         size = np.sqrt(np.einsum("ij,ij->i", change, change) / np.maximum(2 * count, 1))[:, None]
-        self._jitter += self._share(dt, SPREAD_TIME) * (size - self._jitter)
+        change_of_size = self._share(dt, SPREAD_TIME) * (size - self._jitter)
+        self._jitter += np.where(count[:, None] > 0, change_of_size, 0.0)
 
     def _learn(self, residual: Floats, active: Bools, changing: Bools, dt: float) -> None:
         """Let relative biases follow the residuals: the trusted if active, the new always."""
@@ -419,8 +430,7 @@ def _jury(trusted: Bools, changing: Bools, valid: Bools) -> Bools:
     few = trusted.sum(axis=1) < np.maximum(3, valid.sum(axis=1) / 2)
     if not few.any():
         return trusted
-    more = np.where(changing.any(axis=1, keepdims=True), changing, valid)
-    return np.where(few[:, None], more, trusted)
+    return np.where(few[:, None], changing, trusted)
 
 
 def _median(values: Floats, chosen: Bools) -> Floats:

@@ -22,8 +22,8 @@ from risaf_link.core.fusion import EpochBlock
 from risaf_link.mavlink.choice import PATIENCE_US
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import (
-    JUMP_US,
     REVIEW,
+    SET_US,
     EpochAssembler,
     GyroChunk,
     RegularEpochs,
@@ -76,7 +76,7 @@ class BlockReader:
         self._finder: native.EpochFinder | None = None
         if native:
             self._finder = native.EpochFinder(
-                list(self._kinds), IDS["IMU_ARRAY_INFO"], JUMP_US, PATIENCE_US
+                list(self._kinds), IDS["IMU_ARRAY_INFO"], SET_US, PATIENCE_US
             )
 
     def read(self, table: FrameTable, times_us: Stamps) -> Iterator[EpochBlock | tuple[Frame, int]]:

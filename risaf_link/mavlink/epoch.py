@@ -13,7 +13,8 @@ What the gyros read at one instant is an epoch. The rules:
 4. The array has as many sensors as it says (IMU_ARRAY_INFO) or as the configuration says, and at
    least as many as have come. It grows at once; it shrinks when the last sensors have been silent
    for `SHRINK_AFTER` epochs.
-5. Time is the array's. A chunk whose time is far off is set aside. When several in a row are, or
+5. Time is the array's. A chunk whose time is far off is set aside, and so is one whose time its
+   sequence number contradicts. When several in a row are, or
    nothing else has arrived for long, the clock has jumped (the array was rebooted, or its clock was
    set): what is open is handed on, and the length of the step is taken from the arrival times.
 """
@@ -36,6 +37,7 @@ MAX_OPEN = 64  # instants
 REVIEW = 128  # epochs, after which it is reviewed whom an epoch waits for
 SHRINK_AFTER = 8 * REVIEW
 JUMP_US = 1_000_000  # more is far off
+SET_US = 50_000  # so is what an epoch's number contradicts by more; 20 Hz go on at once below it
 BELIEVED = 4  # chunks far off in a row
 STEPS = 15  # from epoch to epoch; their median is the period
 
@@ -139,7 +141,8 @@ class EpochAssembler:
         if chunk.source != self._source:
             return self._change_source(chunk) + self._take(chunk)
         ahead_us, passed_us = self._since_newest(chunk)
-        if -JUMP_US <= ahead_us <= passed_us + JUMP_US:
+        is_near = -JUMP_US <= ahead_us <= passed_us + JUMP_US
+        if is_near and not self._is_contradicted(chunk, ahead_us, passed_us):
             self._drop_astray()
             return self._take(chunk)
         self._astray.append(chunk)
@@ -199,7 +202,7 @@ class EpochAssembler:
         """Take epochs as `add` would take their chunks; they are steady, and all sensors are in.
 
         The chunks of an epoch came together, those of either kind in the order of the sensors. The
-        time goes on from `last` by no more than JUMP_US an epoch, and the sequence number by one.
+        time goes on from `last` by no more than SET_US an epoch, and the sequence number by one.
         """
         if self._last is None or len(block) > self.until_review:
             raise ValueError("block: must follow on an epoch and end with the next review")
@@ -230,6 +233,21 @@ class EpochAssembler:
         newest = self._newest or chunk
         passed_us = max(0, chunk.received_us - newest.received_us)
         return chunk.time_us - newest.time_us, passed_us
+
+    def _is_contradicted(self, chunk: GyroChunk, ahead_us: int, passed_us: int) -> bool:
+        """Whether a chunk's number speaks against its time: back, or ahead though none is missing.
+
+        An array that paused has no numbers for it either, but then nothing arrived for as long.
+        """
+        newest, period_us = self._newest, self._period_us()
+        if newest is None or newest.sequence is None or chunk.sequence is None or not period_us:
+            return False
+        step = (chunk.sequence - newest.sequence) % 65536
+        if step > MAX_OPEN:
+            return False
+        if ahead_us < 0:
+            return step > 0
+        return ahead_us - max(passed_us, (step + 1) * period_us) > SET_US
 
     def _change_clock(self, reason: str) -> list[Epoch]:
         """Follow the clock of the chunks that were set aside."""

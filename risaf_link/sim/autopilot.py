@@ -42,7 +42,7 @@ def gps(scenario: Scenario) -> Iterator[Message]:
     columns = {
         "time_usec": clock_us(f.arrival_s),
         "lat": repeated(np.degrees(f.latitude) * 1e7),
-        "lon": repeated(np.degrees(f.longitude) * 1e7),
+        "lon": _around(repeated(np.degrees(f.longitude) * 1e7)),
         "alt": altitude_mm,
         "alt_ellipsoid": altitude_mm,  # the geoid is taken for the ellipsoid
     }
@@ -79,7 +79,7 @@ def truth(scenario: Scenario) -> Iterator[Message]:
             "time_usec": clock_us(time_s),
             "attitude_quaternion": t.q_nb,
             "lat": whole(np.degrees(t.latitude) * 1e7),
-            "lon": whole(np.degrees(t.longitude) * 1e7),
+            "lon": _around(whole(np.degrees(t.longitude) * 1e7)),
             "alt": whole(t.altitude * 1e3),
             "ind_airspeed": airspeed,
             "true_airspeed": airspeed,
@@ -88,3 +88,10 @@ def truth(scenario: Scenario) -> Iterator[Message]:
         columns |= zip(("vx", "vy", "vz"), whole(t.velocity_n * 1e2).T, strict=True)
         columns |= zip(("xacc", "yacc", "zacc"), whole(t.force_b / GRAVITY * 1e3).T, strict=True)
         yield from table(AUTOPILOT, "HIL_STATE_QUATERNION", columns)
+
+
+def _around(longitude: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Go on from the east behind the date line, 1e-7 deg."""
+    half = 1_800_000_000
+    around: NDArray[np.int64] = (longitude + half) % (2 * half) - half
+    return around

@@ -257,7 +257,10 @@ class Eskf {
       rate_[i] = known[i] ? read[i] - scaled : held[i];
     }
     const Step step = take(rate_before, known, dt);
-    const Vector unseen = see(known, dt, step.has_gap);
+    Vector unseen = see(known, dt, step.has_gap);
+    for (std::size_t i = 0; i < 3; ++i) {
+      unseen[i] += step.unseen[i];
+    }
     const Quaternion before = by_rate_;
     by_rate_ = unit(product(before, exp(rotation(step))));
     drive_ib_ = drive(matrix(between(before, by_rate_, 0.5)), step.rate_b);
@@ -266,9 +269,6 @@ class Eskf {
     elapsed_ += dt;
     remember();
     spread(matrix_ni() * drive_ib_, fused, unseen, step.told, dt);
-    if (step.has_gap) {
-      spread_gap(step.unseen);
-    }
   }
 
   // Whether a heading can be compared; if so, with what outcome.
@@ -488,34 +488,9 @@ class Eskf {
     return c.UNKNOWN_RATE * time * std::min(time / c.LONG_STEP, 1.0);
   }
 
-  // What was turned in a gap; a level vehicle stays level.
-  void spread_gap(const Vector& unseen) {
-    const Matrix matrix_nb = matrix(attitude());
-    const double most = 2.0 * c.initial_tilt_std * c.initial_tilt_std;
-    Matrix turned{};
-    Vector scale{1.0, 1.0, 1.0};
-    for (std::size_t i = 0; i < 3; ++i) {
-      for (std::size_t j = 0; j < 3; ++j) {
-        for (std::size_t k = 0; k < 3; ++k) {
-          turned[i][j] += matrix_nb[i][k] * unseen[k] * matrix_nb[j][k];
-        }
-      }
-    }
-    for (std::size_t i = 0; i < DOWN; ++i) {
-      if (turned[i][i] > most) {
-        scale[i] = std::sqrt(most / turned[i][i]);
-      }
-    }
-    for (std::size_t i = 0; i < 3; ++i) {
-      for (std::size_t j = 0; j < 3; ++j) {
-        covariance_[i][j] += (turned[i][j] + turned[j][i]) / 2.0 * (scale[i] * scale[j]);
-      }
-    }
-    bound();
-  }
-
   void spread(const ByErrors& drive_nb, const FusedAxis* fused, const Vector& unseen, double told,
               double dt) {
+    const std::array<double, 2> before{covariance_[0][0], covariance_[1][1]};
     ByErrors turned_nb;
     for (std::size_t i = 0; i < 3; ++i) {
       for (std::size_t j = 0; j < ERRORS; ++j) {
@@ -559,6 +534,9 @@ class Eskf {
     }
     for (std::size_t i = 0; i < 3; ++i) {
       covariance_[BIAS + i][BIAS + i] += walk[i];
+    }
+    if (unseen[0] + unseen[1] + unseen[2] > 0.0) {
+      keep_level(before);
     }
     bound();
   }
@@ -605,6 +583,21 @@ class Eskf {
     scale.fill(1.0);
     for (std::size_t i = 0; i < 3; ++i) {
       scale[i] = std::min(PI / std::sqrt(covariance_[i][i]), 1.0);
+    }
+    for (std::size_t i = 0; i < STATES; ++i) {
+      for (std::size_t j = 0; j < STATES; ++j) {
+        covariance_[i][j] *= scale[i] * scale[j];
+      }
+    }
+  }
+
+  void keep_level(const std::array<double, 2>& before) {
+    const double down = std::clamp(matrix(attitude())[2][2], 0.0, 1.0);
+    const double level = 2.0 * c.initial_tilt_std * c.initial_tilt_std + 1.0 - down * down;
+    State scale;
+    scale.fill(1.0);
+    for (std::size_t i = 0; i < 2; ++i) {
+      scale[i] = std::min(std::sqrt(std::max(before[i], level) / covariance_[i][i]), 1.0);
     }
     for (std::size_t i = 0; i < STATES; ++i) {
       for (std::size_t j = 0; j < STATES; ++j) {

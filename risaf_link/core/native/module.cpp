@@ -117,6 +117,8 @@ NB_MODULE(_kernel, m) {
   field("noise_time", &risaf::RobustParameters::noise_time);
   field("spread_time", &risaf::RobustParameters::spread_time);
   field("frozen_after", &risaf::RobustParameters::frozen_after);
+  field("repeated_after", &risaf::RobustParameters::repeated_after);
+  field("many", &risaf::RobustParameters::many);
   field("silent_after", &risaf::RobustParameters::silent_after);
   field("dead_after", &risaf::RobustParameters::dead_after);
   field("relearn", &risaf::RobustParameters::relearn);

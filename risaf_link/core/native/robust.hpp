@@ -19,7 +19,8 @@ struct RobustParameters {
   double gate, bias_time, hold_time, resolution, scale_error, gyro_noise, bias_walk;
   // Constants of robust.py, told by it.
   double limit, longest, watch_time, burst_time, burst, swell, noise_time, spread_time;
-  double frozen_after, silent_after, dead_after, relearn, tiny, least_white, prior;
+  double frozen_after, repeated_after, many, silent_after, dead_after, relearn, tiny, least_white,
+      prior;
   std::vector<double> mad_factors;
 };
 
@@ -60,6 +61,11 @@ class Robust {
     by_axis(readings, n, axes_[0].now.data(), axes_[1].now.data(), axes_[2].now.data());
     for (Axis& a : axes_) {
       note_changes(a, dt);
+    }
+    if (all_repeat()) {
+      freeze();
+    }
+    for (Axis& a : axes_) {
       choose_jury(a);
       find_centre(a, dt);
     }
@@ -219,19 +225,46 @@ class Robust {
     }
   }
 
+  double count_of(const Axis& a, std::size_t i) const { return maximum(a.count[i], p.resolution); }
+
+  // Whether all repeat themselves though enough of them should not.
+  bool all_repeat() const {
+    double noisy = 0.0;
+    for (const Axis& a : axes_) {
+      for (std::size_t i = 0; i < n_; ++i) {
+        if (a.valid[i] > 0.0) {
+          if (a.unchanged[i] <= p.repeated_after) {
+            return false;
+          }
+          noisy += 2.0 * a.jitter > count_of(a, i);
+        }
+      }
+    }
+    return noisy >= p.many;
+  }
+
+  void freeze() {
+    for (Axis& a : axes_) {
+      a.frozen = a.valid;
+      std::fill(a.changing.begin(), a.changing.end(), 0.0);
+      std::fill(a.jury.begin(), a.jury.end(), 0.0);
+    }
+  }
+
   void choose_jury(Axis& a) {
     const std::size_t valid = flagged(a.valid);
     a.changing_count = flagged(a.changing);
     a.jury_count = flagged(a.jury);
     if (static_cast<double>(a.jury_count) < std::max(3.0, static_cast<double>(valid) / 2.0)) {
-      a.jury = a.changing_count ? a.changing : a.valid;
-      a.jury_count = a.changing_count ? a.changing_count : valid;
+      a.jury = a.changing;
+      a.jury_count = a.changing_count;
     }
   }
 
   void find_centre(Axis& a, double dt) {
     select(a.offset, a.jury);
-    const double centre = a.centres.median(values_.data(), length(), a.jury_count);
+    const double centre =
+        a.jury_count ? a.centres.median(values_.data(), length(), a.jury_count) : a.centre;
     const double step = centre - a.centre;
     RISAF_EACH
     for (std::size_t i = 0; i < length(); ++i) {
@@ -252,7 +285,9 @@ class Robust {
     if (elapsed_ > 0.0) {
       spread = std::min(spread, p.swell * usual);
     }
-    a.spread += share(dt, p.noise_time) * (spread - a.spread);
+    if (a.jury_count) {
+      a.spread += share(dt, p.noise_time) * (spread - a.spread);
+    }
     return std::max(p.gate * std::max({spread, a.spread, least}), a.nearest);
   }
 
@@ -302,7 +337,9 @@ class Robust {
       a.noise = known + share(dt, p.noise_time) * (square - known);
     }
     const double size = std::sqrt(sum_of_squares(values_) / std::max(2.0 * count, 1.0));
-    a.jitter += share(dt, p.spread_time) * (size - a.jitter);
+    if (a.active_count) {
+      a.jitter += share(dt, p.spread_time) * (size - a.jitter);
+    }
   }
 
   // How far from their centre z may be.
