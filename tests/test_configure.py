@@ -238,7 +238,7 @@ class TestKeptFile:
             (f"FUS_GATE: {10**400}", "expected 2 to 1000"),
             ("FUS_GATE: !!float x", "found 'x', expected one of kind float; left out"),
             ("FUS_GATE: 2026-13-45", "expected one of kind timestamp; left out"),
-            ("[" * 2000, "found more than 32 levels; left out"),
+            ("[" * 2000, "found values more than 32 deep in one another, expected fewer; left out"),
         ],
     )
     def test_what_cannot_be_used_is_said_and_left_out(self, tmp_path, caplog, text, said):

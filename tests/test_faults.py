@@ -65,7 +65,9 @@ def test_a_whole_array_that_freezes_is_not_believed(gps, length):
         assert (health.reason == Reason.FROZEN).all()
         notices = Notices()
         notices.observe(outcome.estimates[-1])
-        told = [notice.text for notice in notices.due(0, has_stalled=False, trouble="")]
+        told = [
+            notice.text for notice in notices.due(0, has_stalled=False, trouble="", complaints={})
+        ]
         assert f"{SENSORS} of {SENSORS} sensors dead" in told
     elif gps:
         assert outcome.std[-1] < 0.02

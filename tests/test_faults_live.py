@@ -12,10 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from msgspec import structs
-from network import texts
-from pymavlink.dialects.v20 import all as public
-from test_service import (
+from daemon import (
     EPOCHS,
     SAFETY_S,
     Ground,
@@ -24,20 +21,21 @@ from test_service import (
     bursts,
     config_for,
     feed,
-    ground,
     is_epoch,
     outputs,
     replayed,
     until,
 )
+from msgspec import structs
+from network import texts
+from pymavlink.dialects.v20 import all as public
 
 from risaf_link import gibberish
 from risaf_link.config import StateParameters
 from risaf_link.links import udp
+from risaf_link.loop import unix_us
 from risaf_link.mavlink.dialect import IDS
-from risaf_link.service import MOST_PEERS, Service, unix_us
-
-__all__ = ["ground"]  # a fixture
+from risaf_link.service import MOST_PEERS, Service
 
 SENT_BAUD, HEARD_BAUD = 921_600, 460_800
 

@@ -6,18 +6,17 @@ import random
 import socket
 
 import pytest
-from network import FAR, GCS, NEAR
-from streams import KEY, seeded, unknown
-from test_service import (
+from daemon import (
     EPOCHS,
     Running,
     address_of,
     bursts,
     config_for,
     feed,
-    ground,  # noqa: F401
     until,
 )
+from network import FAR, GCS, NEAR
+from streams import KEY, seeded, unknown
 from test_signing import link, signed
 from wire import AUTOPILOT, frame
 
@@ -99,7 +98,7 @@ def test_a_frame_whose_checksum_cannot_be_verified_shows_nothing():
     assert gate().worth(FrameTable(cut.buffer, cut.cuts[1:2]), NEAR[0]) is Worth.NOTHING
 
 
-async def test_a_stranger_is_answered_once_it_sends_a_frame(ground):  # noqa: F811
+async def test_a_stranger_is_answered_once_it_sends_a_frame(ground):
     config = config_for(ground, "{name: open, url: 'udpin://127.0.0.1:0'}")
     async with Running(config, up=3) as service:
         port = int(service.links[2].address.rpartition(":")[2])
@@ -111,7 +110,7 @@ async def test_a_stranger_is_answered_once_it_sends_a_frame(ground):  # noqa: F8
 
 
 async def test_strangers_who_flood_the_arrays_port_cost_no_epoch_and_little_memory(
-    ground,  # noqa: F811
+    ground,
     caplog,
 ):
     caplog.set_level(logging.INFO, "risaf_link.links")
