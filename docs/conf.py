@@ -5,12 +5,10 @@ of pages and whole files, is put in for comments here.
 """
 
 import re
-from pathlib import Path
 from typing import Any
 
 from risaf_link import __version__
 
-HERE = Path(__file__).parent
 
 PAGES = {
     "Set it up": ["Install <install>", "configure", "PX4 <px4>", "ArduPilot <ardupilot>"],
@@ -53,15 +51,9 @@ def contents() -> str:
     """The list of pages."""
     trees = []
     for caption, pages in PAGES.items():
-        there = [page for page in pages if (HERE / f"{name_in(page)}.md").exists()]
         head = f"```{{toctree}}\n:hidden:\n:caption: {caption}\n\n"
-        trees.append(head + "\n".join(there) + "\n```\n")
+        trees.append(head + "\n".join(pages) + "\n```\n")
     return "\n".join(trees)
-
-
-def name_in(page: str) -> str:
-    """A page's name, behind the title if it has another one here."""
-    return page.partition("<")[2].rstrip(">") or page
 
 
 def whole(found: re.Match[str]) -> str:

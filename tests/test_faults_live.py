@@ -119,8 +119,8 @@ async def test_half_a_frame_for_ever_costs_no_memory_and_not_the_frame_behind_it
     epochs = [b"".join(burst) for burst in bursts() if is_epoch(burst)]
     half = max(bursts()[0], key=len)[:140]
     async with Running(config_for(ground, first=f"serial://{device}:3000000"), 2) as service:
-        await line.send(half * 50, service)
         tracemalloc.start()
+        await line.send(half * 2000, service)
         memory = traced()
         await line.send(half * 5000, service)
         assert traced() - memory < 100_000  # of 700 000 bytes
@@ -153,7 +153,8 @@ async def test_a_flood_from_strangers_costs_no_memory_and_the_array_no_epoch(gro
                 stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
                 for _ in range(2 * MOST_PEERS)
             ]
-            sent = bursts()
+            first, *sent = bursts()  # the array is known before they come
+            await feed(ground, service, [first])
             for k, burst in enumerate(sent):
                 for i in range(64):
                     whole = heartbeat.heartbeat_encode(i, 8, 0, 0, 0).pack(heartbeat)
@@ -162,13 +163,13 @@ async def test_a_flood_from_strangers_costs_no_memory_and_the_array_no_epoch(gro
                 await feed(ground, service, [burst])
                 if k in {len(sent) // 2, len(sent) - 1}:
                     memory.append(traced())
-        assert len(service.links[0].peers) == udp.MOST_PEERS
+        assert len(service.links[0].peers) <= udp.MOST_PEERS // 2  # of one host
         assert len(service._parsers) <= MOST_PEERS
     tracemalloc.stop()
     assert memory[1] - memory[0] < 100_000
     counts = service.pipeline.assembler.counts
     assert (counts["epochs"], counts["samples_lost"]) == (EPOCHS, 0)
-    assert service.dropped
+    assert service.links[0].counts.dropped_in > 0
 
 
 @pytest.mark.parametrize("jump", [-3600.0, 3600.0, 1e8])
