@@ -273,7 +273,7 @@ async def test_a_page_tells_how_a_log_is_played(recording):
         assert player.now_us == NOW_US + 60_000_000
         for wrong in ({"seek": 3}, {"speed": "fast"}, [], {"seek_us": "now"}):
             assert (await client.post("/play", json=wrong)).status == 400
-        for damage in (b"", b'{"\xff": 1}', b"[" * 10_000):
+        for damage in (b"", b'{"\xff": 1}', b"[" * 4000):
             answer = await client.post(
                 "/play", data=damage, headers={"Content-Type": "application/json"}
             )

@@ -51,6 +51,7 @@ class LiveLink:
 
     def __init__(self) -> None:
         self.vehicles, self.now_us = Vehicles(), START_US
+        self.rejected: dict[str, int] = {}
 
     async def run(self) -> None:
         """Nothing comes but what is given."""
@@ -90,4 +91,4 @@ def _check_metrics(head: bytes) -> None:
         return b"counters"
 
     answer = done(scrape.Page("127.0.0.1", 0, make, "text/plain")._response(head))
-    assert answer.split(b" ")[1] in {b"200", b"404", b"405"}
+    assert answer.split(b" ")[1] in {b"200", b"403", b"404", b"405", b"429"}

@@ -5,6 +5,7 @@ OUT/TARGET/faults; OUT is the variable FUZZ_OUT or `out/fuzz`. At the end the nu
 is printed. See README.md.
 """
 
+import logging
 import os
 import sys
 import traceback
@@ -20,6 +21,8 @@ sys.path[:0] = [str(ROOT), str(HERE.parent)]
 with atheris.instrument_imports(include=["risaf_link"]):
     import targets
 from fuzz_script import mended
+
+logging.getLogger("risaf_link").setLevel(logging.CRITICAL)
 
 WRITTEN = {"config", "kept", "calibration"}  # in YAML
 FRAMED = {"stream", "tlog", "replay"}  # targets of raw frames: their checksums want mending

@@ -5,15 +5,12 @@ program's own, or an answer that another way of asking gives otherwise. The test
 write the bytes, `run.py` lets atheris.
 """
 
-import logging
 from collections.abc import Callable
 
 from fuzz_files import calibration, config, kept, state
 from fuzz_links import component, ingest, service, signing
 from fuzz_pages import page
 from fuzz_streams import replay, stream, tlog
-
-logging.getLogger("risaf_link").setLevel(logging.CRITICAL)
 
 TARGETS: dict[str, Callable[[bytes], None]] = {
     target.__name__: target

@@ -3,6 +3,7 @@
 Longer runs, by atheris: see README.md.
 """
 
+import logging
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,12 @@ FRAMED = ["stream", "tlog", "replay"]
 SCRIPTED = ["ingest", "component", "service", "signing", "page"]
 WRITTEN = ["config", "kept", "calibration", "state"]
 EXAMPLES = {"stream": 400, "tlog": 200, "replay": 40}  # else 100
+
+
+@pytest.fixture(autouse=True)
+def quiet(caplog):
+    """Say nothing of what is found wrong, thousands of times."""
+    caplog.set_level(logging.CRITICAL, "risaf_link")
 
 
 def kept(name: str) -> list[bytes]:
