@@ -9,7 +9,6 @@ from typing import Any
 
 from risaf_link import __version__
 
-
 PAGES = {
     "Set it up": ["Install <install>", "configure", "PX4 <px4>", "ArduPilot <ardupilot>"],
     "Use it": ["mavlink", "mavproxy", "monitor", "recording", "mqtt", "metrics"],
