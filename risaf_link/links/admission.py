@@ -15,7 +15,7 @@ import logging
 from dataclasses import dataclass, field
 
 from risaf_link.links.link import LinkCounts, Worth
-from risaf_link.mavlink.allowance import Allowance
+from risaf_link.mavlink.allowance import Allowance, remember
 
 STRANGERS_A_SECOND, STRANGERS_OF_A_HOST_A_SECOND = 200.0, 20.0  # datagrams
 MOST_HOSTS = 64  # of strangers that are remembered
@@ -72,14 +72,15 @@ class Strangers:
         self._hosts: dict[str, Allowance] = {}
         self._next_telling_s = 0.0
 
-    def admits(self, host: str, now_s: float) -> bool:
-        """Whether one more of them is heard."""
-        few = STRANGERS_OF_A_HOST_A_SECOND
-        of_host = self._hosts.pop(host, None) or Allowance(few, few)
-        self._hosts[host] = of_host
-        if len(self._hosts) > MOST_HOSTS:
-            del self._hosts[next(iter(self._hosts))]
-        return of_host.takes(1.0, now_s) and self._all.takes(1.0, now_s)
+    def place(self, host: str, guests: dict[str, Guest], most: int, now_s: float) -> str | None:
+        """Who has to go for one more of them; what is not to be heard is counted.
+
+        Parameters and result are those of `who_gives_way`.
+        """
+        yielding = who_gives_way(host, guests, most, now_s) if self._admits(host, now_s) else None
+        if yielding is None:
+            self.refuse(now_s)
+        return yielding
 
     def refuse(self, now_s: float) -> None:
         """Count what is not heard; say so, but not all the time."""
@@ -88,6 +89,12 @@ class Strangers:
             self._next_telling_s = now_s + TELL_S
             count = self._counts.dropped_in
             _log.warning("%s: too much comes: %d not heard so far", self._name, count)
+
+    def _admits(self, host: str, now_s: float) -> bool:
+        few = STRANGERS_OF_A_HOST_A_SECOND
+        of_host = self._hosts.get(host) or Allowance(few, few)
+        remember(self._hosts, host, of_host, MOST_HOSTS)
+        return of_host.takes(1.0, now_s) and self._all.takes(1.0, now_s)
 
 
 def who_gives_way(host: str, guests: dict[str, Guest], most: int, now_s: float) -> str | None:

@@ -1,9 +1,10 @@
-"""Our end of an asyncio transport: what streams and datagrams have in common."""
+"""Our end of what a link opens: what streams and datagrams have in common."""
 
 import asyncio
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, cast
 
+from risaf_link.address import shown
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link
 
 Address = tuple[Any, ...]  # as the socket module has it: host, port and, with IPv6, two more
@@ -12,22 +13,43 @@ Address = tuple[Any, ...]  # as the socket module has it: host, port and, with I
 def address_text(address: Address) -> str:
     """Write a socket's address as in a URL."""
     host, port = address[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return shown(host, port)
 
 
-class Endpoint(asyncio.BaseProtocol, ABC):
-    """Our end of one transport; its loss ends the connection."""
-
-    _transport: Any  # Transport or DatagramTransport: asyncio has no type for what they share
+class Endpoint(ABC):
+    """Our end of a socket or of a device; its loss ends the connection."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+
+    async def stay(self, where: str) -> None:
+        """Stay until the connection is lost, and close."""
+        try:
+            self._connection.up(where)
+            await self._connection.lost
+        finally:
+            await self.close()
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Close at once, and wait until that is done."""
+
+    @abstractmethod
+    def send(self, data: bytes) -> None:
+        """Write a frame if there is room for it."""
+
+
+class Stream(Endpoint, asyncio.BaseProtocol):
+    """Our end of a stream of bytes."""
+
+    def __init__(self, connection: Connection) -> None:
+        super().__init__(connection)
         self._full = False
         self._closed = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take the transport."""
-        self._transport = transport
+        self._transport = cast("asyncio.Transport", transport)
 
     def connection_lost(self, error: Exception | None) -> None:
         """End the connection."""
@@ -42,61 +64,28 @@ class Endpoint(asyncio.BaseProtocol, ABC):
         """Note that there is room again."""
         self._full = False
 
-    async def stay(self, where: str) -> None:
-        """Stay until the connection is lost, and close."""
-        try:
-            self._connection.up(where)
-            await self._connection.lost
-        finally:
-            await self.close()
-
     async def close(self) -> None:
         """Close at once, and wait until that is done."""
         if not self._closed.is_set():
             self._transport.abort()
             await self._closed.wait()
 
-    @abstractmethod
+    def take(self, data: bytes) -> None:
+        """Hand on what came."""
+        self._connection.deliver(data, "")
+
     def send(self, data: bytes) -> None:
         """Write a frame if there is room for it."""
-
-    def _takes(self, data: bytes) -> bool:
-        """Tell whether there is room for a frame, and count it."""
         counts = self._connection.counts
         if self._full or self._transport.is_closing():
             counts.dropped_out += 1
-            return False
-        counts.bytes_out += len(data)
-        return True
-
-
-class Stream(Endpoint, asyncio.Protocol):
-    """Our end of a stream of bytes.
-
-    Parameters
-    ----------
-    connection : Connection
-        What the stream belongs to.
-    peer : str
-        Who is at the other end, where there may be several.
-    """
-
-    def __init__(self, connection: Connection, peer: str = "") -> None:
-        super().__init__(connection)
-        self.peer = peer
-
-    def data_received(self, data: bytes) -> None:
-        """Hand it on."""
-        self._connection.deliver(data, self.peer)
-
-    def send(self, data: bytes) -> None:
-        """Write a frame if there is room for it."""
-        if self._takes(data):
+        else:
+            counts.bytes_out += len(data)
             self._transport.write(data)
 
 
 class OnePeerLink(Link):
-    """A link with one peer, at the other end of one transport.
+    """A link with one peer, at the other end of one socket or device.
 
     Parameters
     ----------

@@ -11,6 +11,13 @@ from risaf_link.links.link import BACKOFF, Backoff, Connection
 logging.getLogger("serialx").setLevel(logging.INFO)
 
 
+class _SerialStream(Stream, asyncio.Protocol):
+    """Our end of a line."""
+
+    def data_received(self, data: bytes) -> None:
+        self.take(data)
+
+
 class SerialLink(OnePeerLink):
     """A serial device, eight data bits, no parity, one stop bit, ours alone.
 
@@ -35,7 +42,7 @@ class SerialLink(OnePeerLink):
     async def _connect(self, connection: Connection) -> Stream:
         import serialx  # noqa: PLC0415 (70 ms that other links need not wait for)
 
-        stream = Stream(connection)
+        stream = _SerialStream(connection)
         try:
             transport, _ = await serialx.create_serial_connection(
                 asyncio.get_running_loop(), lambda: stream, self._path, self._baud

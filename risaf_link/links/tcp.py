@@ -6,12 +6,13 @@ import socket
 import time
 from collections.abc import Callable
 
-from risaf_link.links.admission import Guest, Strangers, who_gives_way
+from risaf_link.links.admission import Guest, Strangers
 from risaf_link.links.endpoint import Endpoint, OnePeerLink, Stream, address_text
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link
 
 MOST_CLIENTS = 16
 ANSWER_S = 5.0
+ROOM = 65536  # bytes that are read at once
 
 _log = logging.getLogger(__name__)
 
@@ -25,13 +26,23 @@ _VIGILANCE = [
 ]
 
 
-class _TcpStream(Stream):
-    """A stream that notices when its peer has vanished."""
+class _TcpStream(Stream, asyncio.BufferedProtocol):
+    """A stream that notices when its peer has vanished, and takes memory to read but once."""
+
+    def __init__(self, connection: Connection) -> None:
+        super().__init__(connection)
+        self._room = memoryview(bytearray(ROOM))
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         for option in _VIGILANCE:
             transport.get_extra_info("socket").setsockopt(*option)
+
+    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
+        return self._room
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.take(bytes(self._room[:nbytes]))
 
 
 class TcpOutLink(OnePeerLink):
@@ -116,10 +127,8 @@ class TcpInLink(Link):
         """Take a client in, if there is a place for it."""
         now_s = self._now_s()
         host, guests = client.host, {name: each.guest for name, each in self._clients.items()}
-        admitted = self._strangers.admits(host, now_s)
-        yielding = who_gives_way(host, guests, MOST_CLIENTS, now_s) if admitted else None
+        yielding = self._strangers.place(host, guests, MOST_CLIENTS, now_s)
         if yielding is None:
-            self._strangers.refuse(now_s)
             return False
         if yielding:
             self._clients[yielding].give_way()
@@ -169,7 +178,7 @@ class _Client(_TcpStream):
     def __init__(self, connection: Connection, link: TcpInLink) -> None:
         super().__init__(connection)
         self._link = link
-        self.host = ""
+        self.peer = self.host = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -181,7 +190,7 @@ class _Client(_TcpStream):
         if not self._link.enter(self):
             self._transport.abort()
 
-    def data_received(self, data: bytes) -> None:
+    def take(self, data: bytes) -> None:
         wait_s = self._link.hear(self, data, self._connection)
         if wait_s and not self._transport.is_closing():
             self._transport.pause_reading()

@@ -3,13 +3,12 @@
 import asyncio
 import errno
 import logging
-import os
 import socket
 import time
 from collections.abc import Callable
 from functools import partial
 
-from risaf_link.links.admission import FRAME_BYTES, Guest, Strangers, who_gives_way
+from risaf_link.links.admission import FRAME_BYTES, Guest, Strangers
 from risaf_link.links.endpoint import Address, Endpoint, OnePeerLink, address_text
 from risaf_link.links.link import BACKOFF, Backoff, Connection, Link, Worth
 
@@ -19,75 +18,109 @@ RECEIVE_BUFFER = 4 << 20  # bytes asked for; the system grants what net.core.rme
 
 MOST_AT_ONCE = 64  # datagrams, before other links have their turn
 LARGEST = 65536  # bytes of a datagram
+# A full buffer of the system's, nobody there just now: no trouble of the socket's.
+PASSING = {
+    errno.EAGAIN,
+    errno.ENOBUFS,
+    errno.ECONNREFUSED,
+    errno.EHOSTUNREACH,
+    errno.ENETUNREACH,
+}
 
 _log = logging.getLogger(__name__)
 
 
-def _family(host: str) -> socket.AddressFamily:
-    """Take a name for IPv4, as other MAVLink programs do: `localhost` may well be ::1 first."""
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
+async def _opened(
+    host: str, port: int, join: Callable[[socket.socket, Address], None]
+) -> socket.socket:
+    """Make a socket, and bind or connect it."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET  # `localhost` may be ::1 first
+    try:
+        found = socket.getaddrinfo(
+            host, port, family, socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST
+        )
+    except socket.gaierror:  # a name: to look it up may take long
+        loop = asyncio.get_running_loop()
+        found = await loop.getaddrinfo(host, port, family=family, type=socket.SOCK_DGRAM)
+    *_, address = found[0]
+    udp = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        udp.setblocking(False)
+        udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        join(udp, address)
+    except BaseException:
+        udp.close()
+        raise
+    return udp
 
 
-class _Datagrams(Endpoint, asyncio.DatagramProtocol):
+class _Datagrams(Endpoint):
     """Our end of a UDP socket.
+
+    It reads the socket itself, and all that waits there: asyncio's transport gives one datagram a
+    turn of the loop, and asks for 256 kB of memory for each.
 
     Parameters
     ----------
     connection : Connection
         What the socket belongs to.
+    udp : socket
+        Bound or connected.
     hear : Callable
         Takes a datagram, and the address that it came from.
     """
 
-    def __init__(self, connection: Connection, hear: Callable[[bytes, Address], object]) -> None:
+    def __init__(
+        self, connection: Connection, udp: socket.socket, hear: Callable[[bytes, Address], object]
+    ) -> None:
         super().__init__(connection)
+        self._socket = udp
         self._hear = hear
+        self._room = memoryview(bytearray(LARGEST))
+        asyncio.get_running_loop().add_reader(udp, self._read)
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        udp: socket.socket = transport.get_extra_info("socket")
-        udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        self._socket = socket.socket(fileno=os.dup(udp.fileno()))
-        self._socket.setblocking(False)
-
-    def connection_lost(self, error: Exception | None) -> None:
+    async def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._socket)
         self._socket.close()
-        super().connection_lost(error)
 
     def send(self, data: bytes, address: Address | None = None) -> None:
-        if self._takes(data):
-            self._transport.sendto(data, address)
+        counts = self._connection.counts
+        try:
+            if address is None:
+                self._socket.send(data)
+            else:
+                self._socket.sendto(data, address)
+        except OSError as error:  # the system's buffer is full, or there is trouble
+            counts.dropped_out += 1
+            self._note(error)
+        else:
+            counts.bytes_out += len(data)
 
-    def datagram_received(self, data: bytes, address: Address) -> None:
-        """Take a datagram, and those that have come behind it: the loop would give one a turn."""
-        self._take(data, address)
+    def _read(self) -> None:
+        """Take what has come, as long as other links can wait."""
         for _ in range(MOST_AT_ONCE):
             try:
-                data, address = self._socket.recvfrom(LARGEST)
+                size, address = self._socket.recvfrom_into(self._room)
             except BlockingIOError:
                 return
-            except OSError as error:
-                self.error_received(error)
+            except OSError as error:  # of something that was sent
+                self._connection.counts.dropped_out += 1
+                self._note(error)
                 return
-            self._take(data, address)
+            if size:
+                self._hear(bytes(self._room[:size]), address)
 
-    def _take(self, data: bytes, address: Address) -> None:
-        if data:
-            self._hear(data, address)
-
-    def error_received(self, error: Exception) -> None:  # noqa: ARG002
-        self._connection.counts.dropped_out += 1
+    def _note(self, error: OSError) -> None:
+        """Take note of trouble: a socket that many share lives on."""
 
 
 class _Connected(_Datagrams):
     """A UDP socket with one peer."""
 
-    def error_received(self, error: Exception) -> None:
-        super().error_received(error)
-        # Nobody there just now is no trouble of the socket's. Anything else may be: it keeps the
-        # local address that it was given when it was connected, even when that is no more.
-        absent = errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH
-        if not (isinstance(error, OSError) and error.errno in absent):
+    def _note(self, error: OSError) -> None:
+        # It keeps the local address that it was given when it was connected, even when that is no
+        # more: what does not pass by itself may pass with another socket.
+        if error.errno not in PASSING:
             self._connection.end(error)
 
 
@@ -110,23 +143,14 @@ class UdpOutLink(OnePeerLink):
         self._port = port
 
     async def _connect(self, connection: Connection) -> Endpoint:
-        _, endpoint = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Connected(connection, lambda data, _: connection.deliver(data, "")),
-            remote_addr=(self._host, self._port),
-            family=_family(self._host),
-        )
-        return endpoint
+        udp = await _opened(self._host, self._port, socket.socket.connect)
+        return _Connected(connection, udp, lambda data, _: connection.deliver(data, ""))
 
 
 class UdpInLink(Link):
     """Datagrams from whoever speaks to us; who sends what can be taken is answered.
 
-    Parameters and attributes are those of `TcpInLink`, and
-
-    Parameters
-    ----------
-    now_s : Callable
-        A clock, seconds, that never jumps.
+    Parameters and attributes are those of `TcpInLink`.
     """
 
     def __init__(
@@ -139,7 +163,8 @@ class UdpInLink(Link):
     ) -> None:
         super().__init__(name, backoff)
         self.address = address_text((host, port))
-        self._local = host, port
+        self._host = host
+        self._port = port
         self._now_s = now_s
         self._socket: _Datagrams | None = None
         self._guests: dict[str, Guest] = {}  # by name
@@ -148,12 +173,9 @@ class UdpInLink(Link):
         self._strangers = Strangers(name, self.counts)
 
     async def _hold(self, connection: Connection) -> None:
-        transport, self._socket = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Datagrams(connection, partial(self._hear, connection)),
-            local_addr=self._local,
-            family=_family(self._local[0]),
-        )
-        self.address = address_text(transport.get_extra_info("sockname"))
+        udp = await _opened(self._host, self._port, socket.socket.bind)
+        self._socket = _Datagrams(connection, udp, partial(self._hear, connection))
+        self.address = address_text(udp.getsockname())
         try:
             await self._socket.stay(self.address)
         finally:
@@ -175,10 +197,8 @@ class UdpInLink(Link):
     ) -> None:
         """Take a stranger's datagram; if it was worth it, the stranger is a peer."""
         host = address[0]
-        admitted = self._strangers.admits(host, now_s)
-        yielding = who_gives_way(host, self._guests, MOST_PEERS, now_s) if admitted else None
+        yielding = self._strangers.place(host, self._guests, MOST_PEERS, now_s)
         if yielding is None:
-            self._strangers.refuse(now_s)
             return
         name = address_text(address)
         self._addresses[name] = address  # it may be answered at once

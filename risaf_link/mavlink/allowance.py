@@ -1,4 +1,16 @@
-"""How much of something others may have of us in a second."""
+"""How much others may have of us: of something in a second, and of our memory."""
+
+from typing import TypeVar
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+
+
+def remember(memory: dict[Key, Value], key: Key, value: Value, most: int) -> Value | None:
+    """Keep a value; forget and return that which was renewed longest ago if there are too many."""
+    memory.pop(key, None)
+    memory[key] = value
+    return memory.pop(next(iter(memory))) if len(memory) > most else None
 
 
 class Allowance:
