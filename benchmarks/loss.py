@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from spoiled import BURST, Errors, Receiver, Spoil, sent
+from spoiled import BURST, SOURCES, Errors, Receiver, Spoil
 
 from risaf_link.sim.scenario import scenario
-from risaf_link.sim.stream import EPOCH_START_US
+from risaf_link.sim.stream import EPOCH_START_US, frames
 
 LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 FLIPS = (0.0, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3)
@@ -41,7 +41,7 @@ def run(
 ) -> list[Row]:
     """Spoil the drive of one seed in every way."""
     chosen = scenario(name, seed, sensors=sensors, duration=duration)
-    datagrams = list(sent(chosen))
+    datagrams = list(frames(chosen, SOURCES))
     epochs = round(chosen.duration * chosen.rate)
     rows = []
     for curve in curves:

@@ -34,13 +34,14 @@ from pathlib import Path
 
 import numpy as np
 from killed import SAFETY_S, SENT, NotWholeError, child, in_order, records
-from spoiled import Datagram, sent
+from spoiled import SOURCES, Datagram
 
 from risaf_link.bench.reading import COMMAND
 from risaf_link.core.rotation import wrap, yaws_of
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.remembered import decoded
 from risaf_link.sim.scenario import BOOT_US, Scenario, scenario
+from risaf_link.sim.stream import frames
 
 SENSORS = 80
 SCENARIOS = ("drive1",)  # in turn; a vehicle that stands, as that of drive2 does, shows no heading
@@ -90,7 +91,7 @@ class Vehicle:
         self.port: int = self.heard.getsockname()[1]
         self._to = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._address = ("127.0.0.1", port)
-        self._due: Iterator[Datagram] = sent(chosen)
+        self._due: Iterator[Datagram] = frames(chosen, SOURCES)
         self._next = next(self._due)
         self._began = time.monotonic()
         self.answered: set[bytes] = set()

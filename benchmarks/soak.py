@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from spoiled import Receiver, Spoil, messages
+from spoiled import SOURCES, Receiver, Spoil
 
 from risaf_link.bench.live import memory_mb
 from risaf_link.core.estimate import EstimateBlock
@@ -45,7 +45,7 @@ from risaf_link.sim.receiver_faults import (
     Stuck,
 )
 from risaf_link.sim.scenario import BOOT_US, Scenario, scenario
-from risaf_link.sim.stream import EPOCH_START_US, SYSTEM
+from risaf_link.sim.stream import EPOCH_START_US, SYSTEM, messages
 
 SPELL_S = 120.0  # mean, from one fault of way or clocks to the next
 OUTAGE_S = 600.0  # mean, from one time without GPS to the next
@@ -159,7 +159,7 @@ class Way:
 
     def arrivals(self) -> Iterator[Arrival]:
         """Carry the day's messages."""
-        for message in messages(self._day.scenario):
+        for message in messages(self._day.scenario, SOURCES):
             since_us = message.time_us - BOOT_US
             self._turn_to(since_us)
             while self._kept and self._kept[0][0] <= since_us:

@@ -8,7 +8,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from heapq import merge
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +19,13 @@ from risaf_link.core.rotation import Floats, wraps, yaws_of
 from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.component import HEARD
 from risaf_link.mavlink.dialect import CRC_EXTRA, pack
-from risaf_link.mavlink.frame import FrameParser, encode
-from risaf_link.mavlink.search import checksum_of
+from risaf_link.mavlink.frame import FrameParser
+from risaf_link.mavlink.search import MARK_V2, checksum_of
 from risaf_link.pipeline import Pipeline
 from risaf_link.sim import array, autopilot
-from risaf_link.sim.message import ARRAY, AUTOPILOT, Message, by_time
+from risaf_link.sim.message import AUTOPILOT, Message, heartbeat
 from risaf_link.sim.scenario import BOOT_US, Scenario
-from risaf_link.sim.stream import EPOCH_START_US, SYSTEM
+from risaf_link.sim.stream import EPOCH_START_US
 
 BURST = 100  # datagrams, mean: a quarter of a second of 60 gyros and accelerometers at 100 Hz
 HEADER, CHECKSUM = 10, 2  # bytes of MAVLink 2, without a signature
@@ -71,8 +70,7 @@ def resealed(raw: bytes, at: int, bits: int) -> bytes:
     """Turn some bits of a byte of header or payload round, and put the checksum right."""
     content = bytearray(raw[1:-CHECKSUM])
     content[at - 1] ^= bits
-    extra = CRC_EXTRA[int.from_bytes(content[6:9], "little")]
-    return raw[:1] + bytes(content) + checksum_of(bytes(content), extra)
+    return _sealed(content)
 
 
 def _flipped(raw: bytes, share: float, generator: np.random.Generator) -> bytes:
@@ -95,41 +93,27 @@ def _forged(raw: bytes, generator: np.random.Generator) -> bytes:
     for bit in bits.tolist():
         content[bit // 8] ^= 1 << bit % 8
     content[1] = content[2] = 0  # flags that ask for more than there is: such a frame is dropped
-    message_id = int.from_bytes(content[6:9], "little")
-    extra = CRC_EXTRA.get(message_id, 0)
-    return raw[:1] + bytes(content) + checksum_of(bytes(content), extra)
+    return _sealed(content)
 
 
-def messages(scenario: Scenario) -> Iterator[Message]:
-    """What a scenario's array and autopilot send, not framed yet."""
-    sources = (array.status, array.epochs, autopilot.gps, _clock)
-    yield from merge(*(source(scenario) for source in sources), key=by_time)
+def _sealed(content: bytearray) -> bytes:
+    """Make a frame of what is behind its mark, with a checksum that holds."""
+    extra = CRC_EXTRA.get(int.from_bytes(content[6:9], "little"), 0)
+    return bytes((MARK_V2,)) + content + checksum_of(bytes(content), extra)
 
 
-def sent(scenario: Scenario) -> Iterator[Datagram]:
-    """Frames of a scenario's array and autopilot, a datagram each."""
-    numbers = {AUTOPILOT: 0, ARRAY: 0}
-    for time_us, component, message_id, payload in messages(scenario):
-        yield time_us, encode(message_id, payload, numbers[component] & 0xFF, SYSTEM, component)
-        numbers[component] += 1
-
-
-def _clock(scenario: Scenario) -> Iterator[Message]:
+def clock(scenario: Scenario) -> Iterator[Message]:
     """HEARTBEAT and SYSTEM_TIME of the autopilot, every second."""
-    heartbeat = pack(
-        "HEARTBEAT",
-        type=10,  # MAV_TYPE_GROUND_ROVER
-        autopilot=12,  # MAV_AUTOPILOT_PX4
-        base_mode=0,
-        custom_mode=0,
-        system_status=4,  # MAV_STATE_ACTIVE
-        mavlink_version=3,
-    )
+    pulse = heartbeat(10, 12)  # MAV_TYPE_GROUND_ROVER, MAV_AUTOPILOT_PX4
     for second in range(math.ceil(scenario.duration)):
         time_us = BOOT_US + second * 1_000_000
         boot = {"time_unix_usec": EPOCH_START_US + time_us, "time_boot_ms": time_us // 1000}
-        yield Message(time_us, AUTOPILOT, *heartbeat)
+        yield Message(time_us, AUTOPILOT, *pulse)
         yield Message(time_us, AUTOPILOT, *pack("SYSTEM_TIME", **boot))
+
+
+SOURCES = array.status, array.epochs, autopilot.gps, clock
+"""Of a drive whose autopilot tells the time and no more than it knows."""
 
 
 class Receiver:

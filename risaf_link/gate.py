@@ -12,7 +12,7 @@ import numpy as np
 
 from risaf_link.keys import Keys
 from risaf_link.links import Worth
-from risaf_link.mavlink.allowance import Allowance
+from risaf_link.mavlink.allowance import Allowance, remember
 from risaf_link.mavlink.commands import Peer, concerns
 from risaf_link.mavlink.component import ORDERS
 from risaf_link.mavlink.dialect import IDS, name_of, reader
@@ -51,16 +51,16 @@ class Gate:
     def admitted(self, table: FrameTable, sender: Peer, received_us: int) -> FrameTable:
         """Those frames of a peer that are taken, at a time in microseconds."""
         signing = self._signings.get(sender[0])
+        if signing is not None:
+            table = signing.taken(table)
         ids = table.cuts["message_id"].tolist()
-        if signing is None and _TARGETS.keys().isdisjoint(ids):
+        if _TARGETS.keys().isdisjoint(ids):
             return table
-        taken = [True] * len(table)
-        for row, message_id in enumerate(ids):
-            if signing is not None:
-                taken[row] = signing.accepts(table.frame(row))
-            if taken[row] and message_id in _TARGETS:
-                taken[row] = self._obeys(table.frame(row), sender, received_us / 1e6)
-        return FrameTable(table.buffer, table.cuts[np.array(taken, bool)])
+        taken = [
+            message_id not in _TARGETS or self._obeys(table.frame(row), sender, received_us / 1e6)
+            for row, message_id in enumerate(ids)
+        ]
+        return table.part(np.array(taken, bool))
 
     def worth(self, table: FrameTable, link: str) -> Worth:
         """Whether frames that were taken show that who sent them belongs here."""
@@ -74,10 +74,8 @@ class Gate:
         """Whether an order that is meant for us is not one too many."""
         if not concerns(_TARGETS[frame.message_id](frame.payload), self._own()):
             return True
-        orders = self._orders.pop(sender, None) or Allowance(ORDERS_A_SECOND, ORDERS_AT_ONCE)
-        self._orders[sender] = orders
-        if len(self._orders) > MOST_PEERS:
-            del self._orders[next(iter(self._orders))]
+        orders = self._orders.get(sender) or Allowance(ORDERS_A_SECOND, ORDERS_AT_ONCE)
+        remember(self._orders, sender, orders, MOST_PEERS)
         few_enough = orders.takes(1.0, now_s)
         self.refused["too_many_orders"] += not few_enough
         return few_enough

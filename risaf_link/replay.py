@@ -218,7 +218,7 @@ class Replay:
             chosen = log_time[:until] >= start
             if chosen.any():
                 self._frames += int(np.count_nonzero(chosen))
-                yield FrameTable(table.buffer, table.cuts[:until][chosen]), times_us[:until][chosen]
+                yield table.part(slice(until)).part(chosen), times_us[:until][chosen]
             if until < len(table):
                 return
 

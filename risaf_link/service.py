@@ -20,6 +20,7 @@ from risaf_link.kept import NOTHING_KEPT, KeptParameters
 from risaf_link.keys import open_keys
 from risaf_link.links import Link, TlogLink, Worth, open_link
 from risaf_link.loop import unix_us
+from risaf_link.mavlink.allowance import remember
 from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.component import HEARD, Component
@@ -269,10 +270,10 @@ class Service:
         self._keys.tell_rejected(now_s)
 
     def _parser(self, link: str, peer: str) -> FrameParser:
-        parser = self._parsers.pop((link, peer), None) or FrameParser()
-        self._parsers[link, peer] = parser  # the one that spoke last is last
-        if len(self._parsers) > MOST_PEERS:
-            self._dropped += self._parsers.pop(next(iter(self._parsers))).dropped
+        parser = self._parsers.get((link, peer)) or FrameParser()
+        forgotten = remember(self._parsers, (link, peer), parser, MOST_PEERS)
+        if forgotten:
+            self._dropped += forgotten.dropped
         return parser
 
     def account(self) -> Account:

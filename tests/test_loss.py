@@ -3,11 +3,11 @@
 from functools import cache
 
 import pytest
-from spoiled import BURST, HEADER, Errors, Receiver, Spoil, resealed, sent
+from spoiled import BURST, HEADER, SOURCES, Errors, Receiver, Spoil, resealed
 
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.sim.scenario import scenario
-from risaf_link.sim.stream import EPOCH_START_US
+from risaf_link.sim.stream import EPOCH_START_US, frames
 
 DRIVE = scenario("drive2", 1, sensors=20, duration=60.0)  # on a rough road, shocks and all
 EPOCHS = 6000
@@ -17,7 +17,7 @@ INFO = IDS["IMU_ARRAY_INFO"].to_bytes(3, "little")
 
 @cache
 def datagrams():
-    return tuple(sent(DRIVE))
+    return tuple(frames(DRIVE, SOURCES))
 
 
 def driven(arriving):

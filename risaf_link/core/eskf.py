@@ -261,11 +261,10 @@ class Eskf:
         read = np.where(known, fused.rate_b - self._bias, held)
         rate_before, self._rate = self._rate, np.where(known, read - self._scale @ read, held)
         step = self._gaps.take(rate_before, self._rate, known, dt)
-        has_gap = bool(step.unseen.any())
-        unseen = self._see(known, dt, has_gap) + step.unseen
+        unseen = self._see(known, dt, step.has_gap) + step.unseen
         before = self._by_rate
         self._by_rate = quaternion.unit(
-            quaternion.product(before, quaternion.exp(self._rotation(step, has_gap)))
+            quaternion.product(before, quaternion.exp(self._rotation(step)))
         )
         self._drive_ib = drive(
             quaternion.matrix(quaternion.between(before, self._by_rate, 0.5)), step.rate_b
@@ -424,12 +423,12 @@ class Eskf:
             np.sqrt(np.diag(self._covariance)[BIAS]),
         )
 
-    def _rotation(self, step: Step, has_gap: bool) -> Vector:
+    def _rotation(self, step: Step) -> Vector:
         """Rotation vector of a step, from the rate of this step and of the one before."""
         x, y, z = (step.rate_b * step.told).tolist()
-        follows = not (self._in_gap or has_gap) and step.told < LONG_STEP
+        follows = not (self._in_gap or step.has_gap) and step.told < LONG_STEP
         a, b, c = self._turned if follows else (0.0, 0.0, 0.0)
-        self._turned, self._in_gap = (x, y, z), has_gap
+        self._turned, self._in_gap = (x, y, z), step.has_gap
         return (
             x + (b * z - c * y) / 12.0,
             y + (c * x - a * z) / 12.0,

@@ -35,6 +35,11 @@ class Step(NamedTuple):
     told: float  # s of it
     unseen: Floats  # (3,) rad^2, variance of what was turned besides; zero: there is no gap
 
+    @property
+    def has_gap(self) -> bool:
+        """Whether it was not read as a whole."""
+        return bool(self.unseen.any())
+
 
 class Gaps:
     """Tells gaps from steps, and bridges them."""

@@ -47,10 +47,8 @@ FROZEN_AFTER = 1.0  # s of one reading on the move: filtered counts may stand st
 RATES = 1024  # epochs; a second at 1 kHz
 ROOM = 4 * RATES  # so that room has to be made only now and then
 RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
-SHORTEST_GAP, LONG_STEPS = (
-    0.1,
-    3.0,
-)  # s, and usual steps: what is shorter is turned all but steadily
+SHORTEST_GAP = 0.1  # s; what is shorter is turned all but steadily
+LONG_STEPS = 3.0  # usual steps; likewise
 
 Estimator = Eskf | PaperFilter
 Measured = tuple[float, float, float]
@@ -156,9 +154,9 @@ class Dispute:
         apart = abs(float(halves[0].mean() - halves[1].mean()))
         spread = math.sqrt(sum(float(half.var()) * len(half) for half in halves) / len(errors))
         drifted = drift * after / 2.0  # from half to half
-        return apart < AGREEMENT + 6.0 * noise / math.sqrt(
-            len(errors)
-        ) + drifted and spread < AGREEMENT + 2.0 * noise + drifted / math.sqrt(12.0)
+        most_apart = AGREEMENT + 6.0 * noise / math.sqrt(len(errors)) + drifted
+        widest = AGREEMENT + 2.0 * noise + drifted / math.sqrt(12.0)
+        return apart < most_apart and spread < widest
 
 
 class HeadingGuard:

@@ -14,9 +14,9 @@ What the gyros read at one instant is an epoch. The rules:
    least as many as have come. It grows at once; it shrinks when the last sensors have been silent
    for `SHRINK_AFTER` epochs.
 5. Time is the array's. A chunk whose time is far off is set aside, and so is one whose time its
-   sequence number contradicts. When several in a row are, or
-   nothing else has arrived for long, the clock has jumped (the array was rebooted, or its clock was
-   set): what is open is handed on, and the length of the step is taken from the arrival times.
+   sequence number contradicts. When several in a row are, or nothing else has arrived for long, the
+   clock has jumped (the array was rebooted, or its clock was set): what is open is handed on, and
+   the length of the step is taken from the arrival times.
 """
 
 from collections import Counter, deque

@@ -68,6 +68,10 @@ class FrameTable:
             if message_id != but
         ]
 
+    def part(self, some: slice | NDArray[np.bool_]) -> "FrameTable":
+        """Some of the frames."""
+        return FrameTable(self.buffer, self.cuts[some])
+
     def frame(self, row: int) -> Frame:
         """One of the frames."""
         return _frame(self.buffer, self.cuts[row].item())

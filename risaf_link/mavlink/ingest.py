@@ -8,13 +8,14 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, replace
-from typing import TypeVar, cast
+from typing import cast
 
 import numpy as np
 from msgspec import Struct
 
 from risaf_link.core.heading import GpsFix
 from risaf_link.core.rotation import Floats
+from risaf_link.mavlink.allowance import remember
 from risaf_link.mavlink.choice import Choice, Streams
 from risaf_link.mavlink.dialect import IDS, name_of, reader, text_of
 from risaf_link.mavlink.epoch import MAX_SENSORS, ArrayParameters, GyroChunk, Source
@@ -46,9 +47,6 @@ ARDUPILOT = 3  # MAV_AUTOPILOT
 ON_THE_GROUND = frozenset({10, 11})  # MAV_TYPE of rovers and boats
 GROUND_FILTER, OTHER_FILTER = 4.0, 20.0  # Hz; INS_GYRO_FILTER of ArduPilot, by default
 STALE_FIX_US = 10_000_000  # a fix that is older by less came late; by more, the clock has jumped
-
-Key = TypeVar("Key", bound=Hashable)
-Value = TypeVar("Value")
 
 
 class GpsParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -264,11 +262,11 @@ class Ingest:
         key = (frame.system, frame.component, array_id)
         known = self._infos.get(key, info)
         if known.contradicts(info) and info != self._contested.get(key):
-            _remember(self._contested, key, info)
+            remember(self._contested, key, info, MAX_SENDERS)
             self.counts["contested"] += 1
             return
         self._contested.pop(key, None)
-        _remember(self._infos, key, info)
+        remember(self._infos, key, info, MAX_SENDERS)
 
     def _gyro_array(self, frame: Frame, received_us: int) -> GyroChunk | None:
         return self._dialect_array(frame, received_us, is_gyro=True)
@@ -361,10 +359,10 @@ class Ingest:
     def _heartbeat(self, frame: Frame, _: int) -> None:
         vehicle_type, autopilot = _HEARTBEAT(frame.payload)
         if autopilot != NO_AUTOPILOT:
-            _remember(self._sideways, frame.system, vehicle_type in SIDEWAYS)
+            remember(self._sideways, frame.system, vehicle_type in SIDEWAYS, MAX_SENDERS)
         if autopilot == ARDUPILOT:
             cutoff = GROUND_FILTER if vehicle_type in ON_THE_GROUND else OTHER_FILTER
-            _remember(self._filters, frame.system, cutoff)
+            remember(self._filters, frame.system, cutoff, MAX_SENDERS)
 
     def _gps(self, frame: Frame, received_us: int) -> GpsFix | None:
         name = cast("GpsMessage", name_of(frame.message_id))
@@ -393,16 +391,8 @@ class Ingest:
         else:
             repeated = payload == last_payload
         if not repeated:
-            _remember(self._last_fixes, receiver, (fix.time_us, payload))
+            remember(self._last_fixes, receiver, (fix.time_us, payload), MAX_SENDERS)
         return repeated
-
-
-def _remember(memory: dict[Key, Value], key: Key, value: Value) -> None:
-    """Keep a value; forget the one that was renewed longest ago if there are too many."""
-    memory.pop(key, None)
-    memory[key] = value
-    if len(memory) > MAX_SENDERS:
-        del memory[next(iter(memory))]
 
 
 _IMU = ("xgyro", "ygyro", "zgyro", "xacc", "yacc", "zacc")

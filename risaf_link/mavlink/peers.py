@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import get_args
 
+from risaf_link.mavlink.allowance import remember
 from risaf_link.mavlink.commands import Peer
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.odometry import Profile
@@ -60,14 +61,12 @@ class Peers:
 
     def emitter(self, peer: Peer) -> Emitter:
         """The one that makes the frames for a peer."""
-        emitter = self._emitters.pop(peer, None)
+        emitter = self._emitters.get(peer)
         if emitter is None:
             terms = self._links.get(peer[0], ANY)
             rates = self._rates if terms.rates is None else terms.rates
             emitter = Emitter(rates, *self._own, terms.signing, self._profile)
-            if len(self._emitters) >= MOST_PEERS:
-                del self._emitters[next(iter(self._emitters))]
-        self._emitters[peer] = emitter
+        remember(self._emitters, peer, emitter, MOST_PEERS)
         return emitter
 
     def listening(self, peers: Iterable[Peer]) -> list[Peer]:

@@ -268,7 +268,7 @@ class LinkSigning:
     def taken(self, table: FrameTable) -> FrameTable:
         """Those frames of a table that are taken; the others are counted."""
         taken = [self.accepts(table.frame(row)) for row in range(len(table))]
-        return FrameTable(table.buffer, table.cuts[np.array(taken, bool)])
+        return table.part(np.array(taken, bool))
 
     @property
     def sign(self) -> Callable[[bytes], bytes] | None:

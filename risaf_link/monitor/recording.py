@@ -60,7 +60,7 @@ class Recording:
 
     def feed(self, vehicles: Vehicles, begin: int, end: int) -> None:
         """Let frames, from a row to another, arrive."""
-        table = FrameTable(self._table.buffer, self._table.cuts[begin:end])
+        table = self._table.part(slice(begin, end))
         vehicles.take(table, self.times_us[begin:end])
 
 

@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from risaf_link.links import Link, Worth
+from risaf_link.mavlink.allowance import remember
 from risaf_link.mavlink.frame import FrameParser
 from risaf_link.mavlink.signing import LinkSigning
 from risaf_link.monitor.asking import Asking
@@ -97,10 +98,8 @@ class Live:
                 await asyncio.sleep(TICK_S)
 
     def _receive(self, data: bytes, peer: str) -> Worth:
-        parser = self._parsers.pop(peer, None) or FrameParser()
-        self._parsers[peer] = parser
-        if len(self._parsers) > MOST_PEERS:
-            del self._parsers[next(iter(self._parsers))]
+        parser = self._parsers.get(peer) or FrameParser()
+        remember(self._parsers, peer, parser, MOST_PEERS)
         table = parser.receive_table(data)
         if self._signing:
             self._signing.key.advance(self.now_us)

@@ -6,6 +6,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from risaf_link.mavlink.allowance import remember
 from risaf_link.mavlink.frame import FrameTable
 from risaf_link.mavlink.tlog import Stamps
 
@@ -112,8 +113,6 @@ class Traffic:
 
     def account(self, way: Way) -> Account:
         """The account of a sender; who was heard last is last."""
-        account = self.accounts.pop(way, None) or Account(way)
-        self.accounts[way] = account
-        if len(self.accounts) > MOST_SENDERS:
-            del self.accounts[next(iter(self.accounts))]
+        account = self.accounts.get(way) or Account(way)
+        remember(self.accounts, way, account, MOST_SENDERS)
         return account

@@ -5,6 +5,7 @@ from collections import deque
 import numpy as np
 from msgspec import Struct
 
+from risaf_link.mavlink.allowance import remember
 from risaf_link.mavlink.dialect import IDS, reader
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.timesync import timesync_in
@@ -92,10 +93,8 @@ class Vehicles:
         elif frame.message_id == TIMESYNC:
             self._time(frame, time_us, peer)
         elif frame.message_id in OWN or who in self.estimators:
-            estimator = self.estimators.pop(who, None) or Estimator()
-            self.estimators[who] = estimator
-            if len(self.estimators) > MOST_ESTIMATORS:
-                del self.estimators[next(iter(self.estimators))]
+            estimator = self.estimators.get(who) or Estimator()
+            remember(self.estimators, who, estimator, MOST_ESTIMATORS)
             estimator.take(frame, time_us)
 
     def _note_pulse(self, who: Who, pulse: Pulse) -> None:
@@ -122,9 +121,7 @@ class Vehicles:
                 return
             parts[part:] = [text]  # it may come twice
             if len(text) == TEXT_BYTES:
-                self._texts[key] = parts
-                if len(self._texts) > MOST_TEXTS:
-                    del self._texts[next(iter(self._texts))]
+                remember(self._texts, key, parts, MOST_TEXTS)
                 return
             text = b"".join(parts)
         words = text.decode("utf-8", "replace")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.dialect import IDS, pack
-from risaf_link.sim.message import ARRAY, Message, by_time
+from risaf_link.sim.message import ARRAY, Message, by_time, heartbeat
 from risaf_link.sim.readings import readings
 from risaf_link.sim.scenario import BOOT_US, Scenario
 from risaf_link.sim.sensors import TriadErrors
@@ -39,19 +39,11 @@ def count_scale(errors: TriadErrors) -> float:
 
 def status(scenario: Scenario) -> Iterator[Message]:
     """IMU_ARRAY_INFO and HEARTBEAT, every second."""
-    heartbeat = pack(
-        "HEARTBEAT",
-        type=40,  # MAV_TYPE_IMU
-        autopilot=8,  # MAV_AUTOPILOT_INVALID
-        base_mode=0,
-        custom_mode=0,
-        system_status=4,  # MAV_STATE_ACTIVE
-        mavlink_version=3,
-    )
+    pulse = heartbeat(40, 8)  # MAV_TYPE_IMU, MAV_AUTOPILOT_INVALID
     for second in range(math.ceil(scenario.duration)):
         time_us = BOOT_US + second * 1_000_000
         yield Message(time_us, ARRAY, *_info(scenario, time_us))
-        yield Message(time_us, ARRAY, *heartbeat)
+        yield Message(time_us, ARRAY, *pulse)
 
 
 def _info(scenario: Scenario, time_us: int) -> tuple[int, bytes]:

@@ -44,6 +44,19 @@ def table(
         yield Message(fields["time_usec"], component, *pack(name, **fields, **same))
 
 
+def heartbeat(kind: int, autopilot: int) -> tuple[int, bytes]:
+    """Make the HEARTBEAT of a component that is well: number and payload of the message."""
+    return pack(
+        "HEARTBEAT",
+        type=kind,
+        autopilot=autopilot,
+        base_mode=0,
+        custom_mode=0,
+        system_status=4,  # MAV_STATE_ACTIVE
+        mavlink_version=3,
+    )
+
+
 def whole(values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Round to whole numbers, as most fields want them."""
     return np.rint(values).astype(np.int64)

@@ -37,6 +37,7 @@ from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import Frame, FrameParser
 from risaf_link.mavlink.ingest import Ingest
 from risaf_link.mavlink.parameters import rounded
+from risaf_link.mavlink.peers import EMITTED
 from risaf_link.mavlink.signing import LinkSigning, SigningKey, SigningParameters
 from risaf_link.mavlink.tlog import LEAP_US, record
 from risaf_link.publish.access import MqttParameters, MqttRates
@@ -163,25 +164,12 @@ def _check_parameters(network: Network) -> None:
     check_config(network.parameters.tuned, SILENT)
 
 
-EMITTED = [
-    "ATTITUDE_QUATERNION",
-    "GPS_HEADING_STATUS",
-    "ARRAY_STATUS",
-    "ARRAY_SENSOR_HEALTH",
-    "ARRAY_SENSOR_REASON",
-    "ATTITUDE_QUATERNION_COV",
-    "ESTIMATOR_STATUS",
-    "NAMED_VALUE_FLOAT",
-    "ODOMETRY",
-]
-
-
 def service(data: bytes) -> None:
     """Whatever is sent to the service, all that it says is sound, and a replay says the same."""
     base = configs()[data[0] % len(configs()) if data else 0]
     outputs = {"mqtt": MqttParameters("mqtt://nobody", rates=MqttRates(50, 50, 50, 50))}
     outputs |= {"metrics": MetricsParameters("127.0.0.1:1")}
-    config = structs.replace(base, emit=dict.fromkeys(EMITTED, 8.0), **outputs)
+    config = structs.replace(base, emit=dict.fromkeys(EMITTED.values(), 8.0), **outputs)
     running, all_sent = Deaf(config), list(messages(data[1:]))
     for sent in all_sent:
         running.receive(sent)
