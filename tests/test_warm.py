@@ -20,7 +20,7 @@ from risaf_link.core.memory import ArrayIdentity, Memory
 from risaf_link.core.rotation import wrap
 from risaf_link.core.track import RESETS
 from risaf_link.core.track import WALK as BIAS_WALK
-from risaf_link.core.warm import MOST, Trial
+from risaf_link.core.warm import MOST, TRIAL, Trial
 
 FORMS = {"numpy": (robust, eskf, aiding), "kernel": (kernel, kernel, kernel)}
 UNIX_US, BOOT_US = 1_700_000_000_000_000, 5_000_000
@@ -215,7 +215,7 @@ def test_the_average_nees_of_the_bias_is_within_its_bounds(runs):
 
 
 def test_nothing_is_believed_before_the_trial_is_over():
-    run = restarted(1, 1.0, after=0.9)
+    run = restarted(1, 1.0, after=0.9 * TRIAL)
     assert (run.text, run.state.aligned, run.state.yaw_std) == ("", False, math.pi)
 
 
@@ -291,7 +291,7 @@ def test_another_number_of_sensors_is_another_array():
     world = World(5, sensors=8)
     world.interrupt(12.0)
     run = Run(world, memory).go(6.0)
-    assert run.text == "state ignored: no second of 12 sensors"
+    assert run.text == "state ignored: no 0.5 s of 12 sensors"
 
 
 def test_a_clock_that_stands_still_does_not_keep_it_waiting_for_ever():

@@ -1,9 +1,9 @@
-"""What an interruption has changed, by what is remembered from before and the first second after.
+"""What an interruption has changed, by what is remembered from before and what comes at once after.
 
 Is it the same array?
 ---------------------
 A relative bias explains why a sensor differs from the others. With those that are remembered taken
-off, the sensors must differ no more than without, each by the median of the second: shocks are
+off, the sensors must differ no more than without, each by the median of the trial: shocks are
 shorter. Biases of another array make it worse: their variance adds to what is there. Fewer than
 three sensors cannot be held against one another; they are believed only while their clock has run
 on, since they had power.
@@ -58,7 +58,7 @@ from risaf_link.core.rotation import Floats
 OLDEST = 365 * 86400.0  # s; what seems older was stamped by a clock that was wrong
 SAME_CLOCK, DRIFT = 1.0, 1e-3  # s, and s/s: by how much two clocks that both run on may differ
 STOOD = 10.0  # s between two rests in which a vehicle has not turned
-STANDS = 3e-3  # rad/s, mean over the second, of one at rest: people get in
+STANDS = 3e-3  # rad/s, mean over the trial, of one at rest: people get in
 STANDING_RATE = 1e-3  # rad/s, that it may have turned with in between
 RATE_WALK = 0.25  # rad/s/sqrt(s): three standard deviations are a right-angled corner in 4 s
 KNOWN_YAW = 1.0  # rad; less well known, it is better set than corrected
@@ -78,7 +78,7 @@ class Interruption:
     ----------
     memory : Memory
     epochs : sequence of EpochBlock
-        The first second after it, calibrated; of as many sensors.
+        What came at once after it, calibrated; of as many sensors.
     motions : sequence of Motion
         What GPS said meanwhile.
     """
@@ -241,7 +241,7 @@ class Interruption:
 
     @cached_property
     def _mean_rate(self) -> Floats:
-        """Of the vehicle over the second, (3,), rad/s."""
+        """Of the vehicle over the trial, (3,), rad/s."""
         return np.nan_to_num(_median(self._centre) - self._memory.attitude.bias_b)
 
     @cached_property

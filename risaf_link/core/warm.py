@@ -1,8 +1,8 @@
 """A start that goes on from what was known before a restart, as far as it still holds.
 
-Nothing is believed at once. For the first second the estimator runs as one that knows nothing, and
-says so; what comes in is kept. Then what is remembered is held against it, and what stands goes
-through once more with the same second: no estimate ever rests on a memory that has failed.
+Nothing is believed at once. For the first half second the estimator runs as one that knows nothing,
+and says so; what comes in is kept. Then what is remembered is held against it, and what stands goes
+through once more with what was kept: no estimate ever rests on a memory that has failed.
 """
 
 from collections.abc import Callable
@@ -20,9 +20,9 @@ from risaf_link.core.memory import ArrayIdentity, FilterMemory, Memory
 from risaf_link.core.rotation import Floats
 from risaf_link.core.track import RESETS, Track
 
-TRIAL = 1.0  # s, in which what is remembered is held against what comes
+TRIAL = 0.5  # s, in which what is remembered is held against what comes
 FEWEST = 5  # epochs that it takes
-MOST = 4000  # epochs that are kept: a second at 4 kHz, if their clock moves at all
+MOST = 4000  # epochs that are kept: half a second at 8 kHz, if their clock moves at all
 PATIENCE = 5.0  # s for which an array may be incomplete at first
 UNITS = (("s", 1.0), ("min", 60.0), ("h", 3600.0), ("days", 86400.0))
 
@@ -39,7 +39,7 @@ class Verdict:
 
 
 class Trial:
-    """The first second after a start.
+    """The first half second after a start.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class Trial:
         if fusion.method != "robust" or attitude.filter != "eskf":
             return Verdict("state ignored: it is of another fusion or filter")
         if self._began is None or not self._is_complete:
-            return Verdict(f"state ignored: no second of {len(self.memory.gyros)} sensors")
+            return Verdict(f"state ignored: no {TRIAL:g} s of {len(self.memory.gyros)} sensors")
         epochs = [event for event in self._events if isinstance(event, EpochBlock)]
         motions = [event[0] for event in self._events if not isinstance(event, EpochBlock)]
         interruption = Interruption(self.memory, epochs, motions)
