@@ -443,6 +443,18 @@ def test_a_frame_that_only_starts_in_an_unknown_message_does_not_speak_against_i
         assert raws(*pieces) == [unknown_frame, follower]
 
 
+def test_an_unknown_message_in_garbage_does_not_cost_the_frame_that_begins_in_it():
+    head = b"\xfd\x28\0\0\1\7\x09" + UNKNOWN.to_bytes(3, "little")
+    payload = bytearray(seeded(6).randbytes(253))
+    begin = encode(IDS["GYRO_ARRAY"], bytes(payload), 1, 7, 9)[:40]
+    payload[30:33] = search.checksum_of(head[1:] + begin, 5) + b"\xfd"
+    frame = encode(IDS["GYRO_ARRAY"], bytes(payload), 1, 7, 9)
+    stream = head + frame + heartbeat()
+    assert raws(stream) == [stream[:52], heartbeat()]  # it may well be one
+    for pieces in ([b"\0" + stream], chunks(b"\0" + stream, [1] * 400)):
+        assert raws(*pieces) == [frame, heartbeat()]
+
+
 def test_one_unknown_message_in_256_gets_past_with_a_wrong_checksum():
     random = seeded(41)
     frames = [bytearray(unknown(random)) for _ in range(5000)]

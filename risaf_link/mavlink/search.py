@@ -11,11 +11,12 @@ Three rules keep one bad byte from costing more than its own frame:
    last byte or for a part of its signature, which no checksum covers. The search goes on there.
 3. The CRC_EXTRA of a message without a known definition is not known either; but its checksum must
    fit some CRC_EXTRA, as one in 256 does by chance. Such a frame is believed if moreover a mark
-   follows it, or the end of the stream, and if no frame of a known message lies inside of it.
+   follows it, or the end of the stream, and if no frame of a known message lies inside of it; where
+   it does not follow a good frame, none may begin inside of it either.
 
 Whether a frame is returned depends on the bytes of the stream alone and never on how they were cut
-into chunks. What cannot be decided yet stays in the buffer: little more than a frame. A frame of a
-known message does not wait for what follows it.
+into chunks. What cannot be decided yet stays in the buffer: little more than a frame, or than two
+where the third rule has to wait. A frame of a known message does not wait for what follows it.
 
 Where every frame of a stream comes with a prefix (the time stamp in a tlog), its size tells where a
 frame must start.
@@ -125,7 +126,7 @@ class Search:
         at = free = 0  # the next frame may start from `free` on
         while True:
             start = done + self._prefix_size if in_step else self._next_mark(at)
-            found = self._header_if_frame(start) if start < len(self._buffer) else _No.END
+            found = self._found(start, in_step) if start < len(self._buffer) else _No.END
             if isinstance(found, _Header):
                 prefix = max(min(self._prefix_size, start - done), 0)
                 skipped += max(start - prefix - done, 0)
@@ -149,14 +150,14 @@ class Search:
         mark = _MARK.search(self._buffer, at)
         return mark.start() if mark else len(self._buffer)
 
-    def _header_if_frame(self, start: int) -> _Header | _No:
+    def _found(self, start: int, in_step: bool) -> _Header | _No:
         header = self._header_at(start)
         if isinstance(header, _No):
             return header
         known = header.message_id in CRC_EXTRA
         fault = self._fault(start, header)
         if fault is None and not known:
-            fault = self._doubt(start, header)
+            fault = self._doubt(start, header, in_step)
         return header if fault is None else fault
 
     def _header_at(self, start: int) -> _Header | _No:
@@ -195,7 +196,7 @@ class Search:
         holds = fits_any(content, sent) if extra is None else sent == checksum_of(content, extra)
         return None if holds else _No.CHECKSUM
 
-    def _doubt(self, start: int, header: _Header) -> _No | None:
+    def _doubt(self, start: int, header: _Header, in_step: bool) -> _No | None:
         """Why an unknown message is not believed: the third rule at the head of this module."""
         behind = header.end + self._prefix_size
         if behind < len(self._buffer):
@@ -203,16 +204,21 @@ class Search:
                 return _No.UNVERIFIED
         elif not self._ended:
             return _No.END
-        for mark in _MARK.finditer(self._buffer, start + 1, header.checksum):
+        open_end = None
+        for mark in _MARK.finditer(self._buffer, start + 1, header.end):
             inner = self._header_at(mark.start())
-            if (
-                isinstance(inner, _Header)
-                and inner.message_id in CRC_EXTRA
-                and inner.end <= header.end
-                and self._fault(mark.start(), inner) is None
-            ):
+            fault: _No | None
+            if isinstance(inner, _No):
+                fault = inner
+            elif inner.message_id not in CRC_EXTRA or (in_step and inner.end > header.end):
+                continue
+            else:
+                fault = self._fault(mark.start(), inner)
+            if fault is None:
                 return _No.UNVERIFIED
-        return None
+            if fault is _No.END and not (in_step or self._ended):
+                open_end = _No.END
+        return open_end
 
 
 def _is_signed(header: _Header) -> bool:

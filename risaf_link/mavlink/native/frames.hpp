@@ -1,4 +1,4 @@
-// Frames in a stream: `Search` in frame.py, whose text says what is done; names are the same.
+// Frames in a stream: `Search` in search.py, whose text says what is done; names are the same.
 #pragma once
 
 #include <algorithm>
@@ -67,7 +67,7 @@ class Checksum {
 
 inline constexpr Checksum::Table Checksum::TABLE = Checksum::made();
 
-// One frame: `CUT` in frame.py.
+// One frame: `CUT` in search.py.
 struct Cut {
   std::int64_t start;
   std::int32_t prefix;
@@ -99,7 +99,7 @@ class Search {
       start = in_step ? done + prefix_size_ : next_mark(at);
       Cut found;
       No no = No::END;
-      if (start < size_ && is_frame(start, &found, &no)) {
+      if (start < size_ && is_frame(start, in_step, &found, &no)) {
         const std::size_t between = start - std::min(start, done);
         const std::size_t prefix = std::min(prefix_size_, between);
         found.prefix = static_cast<std::int32_t>(prefix);
@@ -137,9 +137,9 @@ class Search {
     return std::min(at, size_);
   }
 
-  bool is_frame(std::size_t start, Cut* found, No* no) {
+  bool is_frame(std::size_t start, bool in_step, Cut* found, No* no) {
     return read_header(start, found, no) && !is_faulty(*found, no) &&
-           (found->known || !is_doubtful(*found, no));
+           (found->known || !is_doubtful(*found, in_step, no));
   }
 
   bool read_header(std::size_t start, Cut* found, No* no) const {
@@ -181,8 +181,8 @@ class Search {
     return !holds;
   }
 
-  // Whether an unknown message is not believed: the third rule in frame.py.
-  bool is_doubtful(const Cut& cut, No* no) {
+  // Whether an unknown message is not believed: the third rule in search.py.
+  bool is_doubtful(const Cut& cut, bool in_step, No* no) {
     const std::size_t end = end_of(cut), behind = end + prefix_size_;
     if (behind < size_) {
       if (!is_mark(buffer_[behind])) {
@@ -193,15 +193,24 @@ class Search {
       *no = No::END;
       return true;
     }
-    for (auto at = static_cast<std::size_t>(cut.start) + 1; at < checksum_of(cut); ++at) {
+    bool must_wait = false;
+    for (auto at = next_mark(static_cast<std::size_t>(cut.start) + 1); at < end;
+         at = next_mark(at + 1)) {
       Cut inner;
-      if (is_mark(buffer_[at]) && read_header(at, &inner, no) && inner.known &&
-          end_of(inner) <= end && !is_faulty(inner, no)) {
-        *no = No::UNVERIFIED;
-        return true;
+      No why = No::MARK;
+      if (read_header(at, &inner, &why)) {
+        if (!inner.known || (in_step && end_of(inner) > end)) {
+          continue;
+        }
+        if (!is_faulty(inner, &why)) {
+          *no = No::UNVERIFIED;
+          return true;
+        }
       }
+      must_wait = must_wait || (why == No::END && !in_step && !ended_);
     }
-    return false;
+    *no = No::END;
+    return must_wait;
   }
 
   std::int16_t extra_of(std::uint32_t message_id) const {
