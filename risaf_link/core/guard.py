@@ -45,6 +45,7 @@ BIAS_GATE = 5.0  # standard deviations by which the bias may be off, for the gyr
 AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
 FROZEN_AFTER = 1.0  # s of one reading on the move: filtered counts may stand still on calm water
 RATES = 1024  # epochs; a second at 1 kHz
+NO_READING: Floats = np.full((1, 3), math.nan)
 ROOM = 4 * RATES  # so that room has to be made only now and then
 RATE_SPAN = 0.1  # s before and after, over which a past rate is taken
 SHORTEST_GAP = 0.1  # s; what is shorter is turned all but steadily
@@ -191,7 +192,7 @@ class HeadingGuard:
         self._bias_std = 0.0  # rad/s, on the axis on which it is largest
         self._confirmed = 0.0  # s for which headings have agreed with yaw
         self._is_hearsay = False  # yaw is remembered, and no heading has agreed with it since
-        self._reading = np.full((1, 3), math.nan)  # the last one of a gyro that is alone
+        self._reading = NO_READING  # the last one of a gyro that is alone
         self._changed = 0.0  # s, when it was another
 
     def configure(self, parameters: HeadingParameters) -> None:
@@ -245,7 +246,11 @@ class HeadingGuard:
 
     def _note_readings(self, values: Floats, elapsed: Floats) -> None:
         """Take note of when a gyro that is alone read something else."""
-        alone = np.where(values[:, VALID, np.newaxis] == 1, values[:, FUSED], math.nan)
+        is_alone = values[:, VALID] == 1
+        if not is_alone.any():
+            self._reading, self._changed = NO_READING, float(elapsed[-1])
+            return
+        alone = np.where(is_alone[:, np.newaxis], values[:, FUSED], math.nan)
         readings = np.concatenate((self._reading, alone))
         changed = np.flatnonzero((readings[1:] != readings[:-1]).any(axis=1))  # so does NaN
         if len(changed):
@@ -266,7 +271,7 @@ class HeadingGuard:
         np.multiply(rate_b, dt[:, np.newaxis], out=turns)
         turns[0] += last[:3]
         if len(dt) > 1:
-            np.cumsum(turns, axis=0, out=turns)
+            np.add.accumulate(turns, axis=0, out=turns)
         fresh[:, 3] = elapsed
         self._turns += len(dt)
 

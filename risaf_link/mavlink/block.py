@@ -7,7 +7,8 @@ comes out otherwise than it would frame by frame; it only comes sooner.
 
 A frame that has nothing to do with the array, a GPS fix, say, is handed on between two epochs; one
 that came within an epoch, before it. Such a frame does not know that ingest and assembler have
-taken epochs behind it already.
+taken epochs behind it already. What no estimate can depend on (an IMU_ARRAY_INFO that repeats the
+last one, a HEARTBEAT of what is no autopilot) parts no block: it is handed on with what comes next.
 
 The kernel finds the epochs. Where it was not built, every frame is handed on alone.
 """
@@ -31,6 +32,7 @@ from risaf_link.mavlink.epoch import (
 )
 from risaf_link.mavlink.frame import Frame, FrameTable
 from risaf_link.mavlink.gps import READERS
+from risaf_link.mavlink.identity import NO_AUTOPILOT, autopilot_in
 from risaf_link.mavlink.ingest import NONE, ArrayInfo, Ingest
 from risaf_link.mavlink.tlog import Stamps
 
@@ -103,13 +105,20 @@ class BlockReader:
             most = min(self._assembler.until_review, self._longest)
             block = self._block(table, times_us, most)
             if block is not None:
-                done = 0
+                done, idle = 0, list[tuple[Frame, int]]()
                 for row, before in block.asides:
+                    aside = table.frame(row), int(times_us[row])
+                    if _is_idle(aside[0]):
+                        idle.append(aside)
+                        continue
                     if done < before:
                         yield block.part(slice(done, before))
                     done = before
-                    yield table.frame(row), int(times_us[row])
+                    yield from idle
+                    idle.clear()
+                    yield aside
                 yield block.part(slice(done, None)) if done else block
+                yield from idle
                 if block.end == len(table):
                     return
                 if len(block) == most:
@@ -167,6 +176,13 @@ class BlockReader:
                 native.Sensors(forces, *info.count_of(is_gyro=False)),
                 info.payload,
             )
+
+
+def _is_idle(aside: Frame) -> bool:
+    """Whether no estimate can depend on a frame that was found beside epochs."""
+    return aside.message_id == IDS["IMU_ARRAY_INFO"] or (
+        aside.message_id == IDS["HEARTBEAT"] and autopilot_in(aside) == NO_AUTOPILOT
+    )
 
 
 def _kinds(ingest: Ingest, apart: Collection[int]) -> bytearray:

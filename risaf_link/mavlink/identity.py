@@ -15,6 +15,11 @@ ARMED_FOR_US = 5_000_000  # since the last HEARTBEAT
 _HEARTBEAT = reader("HEARTBEAT", "type", "autopilot", "base_mode")
 
 
+def autopilot_in(frame: Frame) -> int:
+    """Which autopilot a HEARTBEAT is of: MAV_AUTOPILOT."""
+    return int(_HEARTBEAT(frame.payload)[1])
+
+
 def autopilot_mode(frame: Frame) -> int | None:
     """Base mode in the HEARTBEAT of an autopilot; None: the frame is no such thing."""
     if frame.message_id != IDS["HEARTBEAT"]:
@@ -75,9 +80,8 @@ class Identity:
         renamed = self._undecided and self._decide(frame.system, received_us)
         if frame.system == self.system:
             self._armed_us = received_us if base_mode & ARMED else None
-            _, autopilot, _ = _HEARTBEAT(frame.payload)
             if self._follows:
-                self.profile = AUTOPILOTS.get(autopilot, self.profile)
+                self.profile = AUTOPILOTS.get(autopilot_in(frame), self.profile)
         return renamed
 
     def _decide(self, system: int, received_us: int) -> bool:
