@@ -51,7 +51,8 @@ class Log:
         gyros, accels, part, forces_first = self.shape
         time_us = START_US + k * PERIOD_US
         if k % 100 == 0:
-            yield time_us, "IMU_ARRAY_INFO", told(gyros, accels), sender
+            info = told(gyros, accels, time_usec=BOOT_US + k * PERIOD_US)
+            yield time_us, "IMU_ARRAY_INFO", info, sender
         kinds = [("GYRO_ARRAY", gyros), ("ACCEL_ARRAY", accels)]
         for name, count in kinds[::-1] if forces_first else kinds:
             for first in range(0, count, part):

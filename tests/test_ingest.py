@@ -112,7 +112,7 @@ class TestOurDialect:
         reader = ingest(info(), info(gyro_scale=2e-3), info())
         assert reader.decode(array(1, [(1, 1, 1)]), 0).rates_s == pytest.approx(1e-3)
         assert reader.counts == Counter(contested=1)
-        reader = ingest(info(), info(gyro_scale=2e-3), info(gyro_scale=2e-3), info(gyro_scale=2e-3))
+        reader = ingest(info(), *(info(gyro_scale=2e-3, time_usec=at) for at in (1, 2, 3)))
         assert reader.decode(array(1, [(1, 1, 1)]), 0).rates_s == pytest.approx(2e-3)
         assert reader.counts == Counter(contested=1)
 

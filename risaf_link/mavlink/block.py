@@ -174,7 +174,7 @@ class BlockReader:
                 source.array_id,
                 native.Sensors(gyros, *info.count_of(is_gyro=True)),
                 native.Sensors(forces, *info.count_of(is_gyro=False)),
-                info.payload,
+                info.told,
             )
 
 

@@ -31,6 +31,7 @@ MAX_SENDERS = 64  # of one kind of message that are remembered
 NONE = np.zeros((0, 3))
 
 ARRAY_HEAD = struct.Struct("<QHH")  # time_usec, epoch_seq, first_sensor
+INFO_TIME = 8  # bytes of IMU_ARRAY_INFO that tell the time: they are first
 ARRAY_SIZE = 254  # payload of GYRO_ARRAY and ACCEL_ARRAY; its last bytes: sensor_count, array_id
 ARRAY_CAPACITY, DEBUG_CAPACITY = 40, 19  # sensors a message
 SCALED_IMUS = [IDS["SCALED_IMU"], IDS["SCALED_IMU2"], IDS["SCALED_IMU3"]]
@@ -65,7 +66,7 @@ class ArrayInfo:
     accel_scale: float  # m/s^2 per count; NaN: no accelerometers
     accel_range: float  # m/s^2; inf: not known
     sensors: int  # 0: not known
-    payload: bytes = b""  # that said so; empty: it is assumed
+    told: bytes = b""  # payload that said so, behind its time; empty: it is assumed
 
     def contradicts(self, other: "ArrayInfo") -> bool:
         """Whether an array of this name cannot be both."""
@@ -257,7 +258,7 @@ class Ingest:
             accel_scale if 0 < accel_scale < math.inf else math.nan,
             accel_limit if accel_limit > 0 else math.inf,
             sensors,
-            frame.payload,
+            frame.payload[INFO_TIME:],
         )
         key = (frame.system, frame.component, array_id)
         known = self._infos.get(key, info)

@@ -28,7 +28,7 @@ struct Sensors {
 struct ArrayLayout {
   std::uint8_t system, component, array_id;
   Sensors gyros, accels;
-  std::vector<std::uint8_t> told;  // payload of its last IMU_ARRAY_INFO; empty: there was none
+  std::vector<std::uint8_t> told;  // by its last IMU_ARRAY_INFO, behind the time; empty: nothing
 };
 
 // How the last epoch ended, and this one may go on.
@@ -54,7 +54,7 @@ struct Unusable {
 class EpochFinder {
  public:
   static constexpr std::int64_t LATEST_US = std::int64_t{1} << 62;
-  static constexpr std::size_t HEAD = 12, COUNT = 252, ARRAY_ID = 253, CAPACITY = 40;
+  static constexpr std::size_t INFO_TIME = 8, HEAD = 12, COUNT = 252, ARRAY_ID = 253, CAPACITY = 40;
   static constexpr std::int16_t INVALID = -32768;
 
   // `kinds` by message id; `info_id`: of IMU_ARRAY_INFO; `jump_us`: a step that is no usual one;
@@ -194,8 +194,10 @@ class EpochFinder {
   bool repeats(const ArrayLayout& array, std::size_t row) const {
     const Cut& cut = cuts_[row];
     return cut.message_id == info_id_ && cut.system == array.system &&
-           cut.component == array.component && cut.size > 0 && cut.size == array.told.size() &&
-           std::memcmp(buffer_ + cut.payload(), array.told.data(), cut.size) == 0;
+           cut.component == array.component && !array.told.empty() &&
+           cut.size == INFO_TIME + array.told.size() &&
+           std::memcmp(buffer_ + cut.payload() + INFO_TIME, array.told.data(),
+                       array.told.size()) == 0;
   }
 
   template <typename T>
