@@ -6,7 +6,7 @@ together, and what is wrong with them is said.
 
 import re
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any
@@ -268,9 +268,15 @@ def _child(place: Any, key: str) -> Any:
 
 def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = Config) -> str:
     """What msgspec found wrong: which key, what was found, what was expected."""
-    message, _, path = str(error).partition(" - at ")
-    of_key = path.startswith("`key`")
-    steps = re.findall(r"\w+|\.\.\.", path.partition("$")[2])
+    for odd in _with_backtick(tree):
+        known = _names(_kinds_at(schema, odd[:-1]), of_key=True)
+        if known:
+            return f"{'.'.join(odd)}: unknown key; known: {', '.join(known)}"
+    message, place = str(error), re.search(r" - at (`key` in )?`\$([^`]*)`\Z", str(error))
+    of_key, path = place.groups() if place else ("", "")
+    if place:
+        message = message[: place.start()]
+    steps = re.findall(r"\w+|\.\.\.", path)
     if "..." in steps:
         steps[steps.index("...")] = _culprit(error, tree, steps, schema)
     kinds = _kinds_at(schema, steps)
@@ -290,6 +296,16 @@ def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = C
     else:
         expected = re.sub(r"^Expected |`|, got .*$", "", message).replace("null", "nothing")
     return f"{key}: found {_short(found)}, expected {expected}"
+
+
+def _with_backtick(tree: Any, place: tuple[str, ...] = ()) -> Iterator[list[str]]:
+    """Places of keys that could be taken for the end of a quotation of msgspec's."""
+    if isinstance(tree, dict | list):
+        for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
+            inside = (*place, str(key))
+            if "`" in inside[-1]:
+                yield list(inside)
+            yield from _with_backtick(value, inside)
 
 
 def _kinds_at(schema: type[Struct], steps: list[str]) -> list[inspect.Type]:
