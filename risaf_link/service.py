@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -210,7 +211,7 @@ class Service:
                 self._component.receive(frame, sender, received_us)
                 self._send(self.pipeline.gather(frame, received_us))
                 self._send(self.pipeline.release())
-        self._hand_out(self._component.collect(self._peers()))
+        self._hand_out(self._component.collect(chain(self._peers(), (sender,))))
         self._tell_mismatch()
         self._tell_recalled()
         if self.pipeline.ingest.heard_us != before_us:

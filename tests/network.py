@@ -79,7 +79,7 @@ class Network:
     def take(self, sent: Frame, peer=NEAR) -> list[Any]:
         """Let a frame arrive; what the one who sent it hears of it."""
         self.component.receive(sent, peer, self.now_us)
-        return self.heard().get(peer, [])
+        return self.heard(peer).get(peer, [])
 
     def command(self, command: int, *values: float, peer=NEAR, sender=GCS, **to: int) -> list[Any]:
         """Send a COMMAND_LONG."""
@@ -106,9 +106,9 @@ class Network:
         self.component.observe(estimate)
         return self._decoded(self.component.emit(estimate, self.peers))
 
-    def heard(self) -> dict[Any, list[Any]]:
-        """What each peer hears now."""
-        return self._decoded(self.component.collect(self.peers))
+    def heard(self, *speakers: Any) -> dict[Any, list[Any]]:
+        """What each peer hears now, and each of those who have just spoken."""
+        return self._decoded(self.component.collect([*self.peers, *speakers]))
 
     def _decoded(self, frames: list[tuple[Any, bytes]]) -> dict[Any, list[Any]]:
         messages: defaultdict[Any, list[Any]] = defaultdict(list)

@@ -132,6 +132,20 @@ async def test_a_client_that_does_not_read_costs_only_itself(ground):
     assert service.links[1].counts.dropped_out == before
 
 
+async def test_who_sets_a_parameter_with_its_first_datagram_is_answered(ground):
+    config = config_for(ground, "{name: stations, url: 'udpin://127.0.0.1:0'}")
+    codec = public.MAVLink(None, 255, 190)
+    order = codec.param_set_encode(1, 191, b"FUS_GATE", 6.0, 9).pack(codec)
+    async with Running(config, up=3) as service:
+        host, _, port = service.links[2].address.partition(":")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+            station.setblocking(False)
+            station.sendto(order, (host, int(port)))
+            raw = await asyncio.get_running_loop().sock_recv(station, 300)
+    answer = public.MAVLink(None).parse_buffer(raw)[0]
+    assert (answer.get_type(), answer.param_value) == ("PARAM_VALUE", 6.0)
+
+
 async def test_heartbeat_tells_whether_epochs_come(ground):
     async with Running(config_for(ground), up=2):
         heartbeat = public.MAVLink(None).parse_buffer((await ground.next("HEARTBEAT")).raw)[0]

@@ -257,12 +257,13 @@ class Component:
         Parameters
         ----------
         peers : iterable of Peer
-            Who can be reached now. What is for all goes to those of them that get anything.
+            Who can be reached now, and who was just heard. What is for all goes to those of them
+            that get anything, once.
         """
         outbox, self._outbox = self._outbox, []
         if not outbox:
             return []
-        listening = self._peers.listening(peers)
+        listening = self._peers.listening(dict.fromkeys(peers))
         return [
             (peer, self._peers.emitter(peer).frame(name, **fields))
             for to, name, fields in outbox
