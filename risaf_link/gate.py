@@ -53,7 +53,7 @@ class Gate:
         signing = self._signings.get(sender[0])
         if signing is not None:
             table = signing.taken(table)
-        ids = table.cuts["message_id"].tolist()
+        ids = [message_id for message_id, *_ in table.origins]
         if _TARGETS.keys().isdisjoint(ids):
             return table
         taken = [

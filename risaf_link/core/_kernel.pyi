@@ -168,15 +168,15 @@ class ArrayLayout:
 
 class EpochFinder:
     def __init__(self, kinds: list[int], info_id: int, jump_us: int, patience_us: int) -> None: ...
-    def load(
-        self, buffer: bytes, cuts: NDArray[np.uint8], times_us: NDArray[np.uint64]
-    ) -> None: ...
+    def load(self, buffer: bytes, records: bytes, times_us: NDArray[np.uint64]) -> None: ...
     def take(
         self, array: ArrayLayout, time_us: int, sequence: int, heard_us: int, most: int
     ) -> (
         tuple[
-            tuple[NDArray[np.int64], Floats, Floats, Floats, NDArray[np.int64]],
-            tuple[int, int, int, int],
+            int,
+            bytes,
+            tuple[int, int, int],
+            int,
             int,
             tuple[int, int],
             list[int],

@@ -17,9 +17,11 @@ from collections.abc import Collection, Iterator
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from risaf_link.core.compiled import native
 from risaf_link.core.fusion import EpochBlock
+from risaf_link.core.rotation import Floats
 from risaf_link.mavlink.choice import PATIENCE_US
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import (
@@ -35,6 +37,9 @@ from risaf_link.mavlink.gps import READERS
 from risaf_link.mavlink.identity import NO_AUTOPILOT, autopilot_in
 from risaf_link.mavlink.ingest import NONE, ArrayInfo, Ingest
 from risaf_link.mavlink.tlog import Stamps
+
+Columns = tuple[NDArray[np.int64], Floats, Floats, Floats, NDArray[np.int64]]
+"""Those of an `EpochBlock`."""
 
 
 class Kind(IntEnum):
@@ -100,10 +105,10 @@ class BlockReader:
             rows = np.flatnonzero(np.isin(table.cuts["message_id"], np.flatnonzero(self._kinds)))
             yield from ((table.frame(row), int(times_us[row])) for row in rows.tolist())
             return
-        self._finder.load(table.buffer, table.cuts.view(np.uint8), times_us)
+        self._finder.load(table.buffer, table.records, times_us)
         while True:
             most = min(self._assembler.until_review, self._longest)
-            block = self._block(table, times_us, most)
+            block = self._block(table, most)
             if block is not None:
                 done, idle = 0, list[tuple[Frame, int]]()
                 for row, before in block.asides:
@@ -141,7 +146,7 @@ class BlockReader:
                 self._lay_out(source, info)
         return self._steady
 
-    def _block(self, table: FrameTable, times_us: Stamps, most: int) -> RegularEpochs | None:
+    def _block(self, table: FrameTable, most: int) -> RegularEpochs | None:
         last = self._assembler.last
         if self._finder is None or not self.is_steady or self._laid_out is None:
             return None
@@ -152,16 +157,31 @@ class BlockReader:
         found = self._finder.take(self._layout, last.time_us, last.sequence, heard_us, most)
         if found is None:
             return None
-        columns, (newest, begun, heard, last_row), sequence, unusable, refused, asides = found
-        time_us = int(columns[0][-1])
-        came_newest, came_begun = (
-            GyroChunk(source, time_us, int(times_us[row]), 0, NONE, NONE, sequence, info.sensors)
-            for row in (newest, begun)
+        size, values, came_us, last_row, sequence, unusable, refused, asides = found
+        columns = self._columns(values, size)
+        newest_us, begun_us, heard_us = came_us
+        time_us = columns[0].item(-1)
+        newest, begun = (
+            GyroChunk(source, time_us, received_us, 0, NONE, NONE, sequence, info.sensors)
+            for received_us in (newest_us, begun_us)
         )
-        block = RegularEpochs(*columns, came_newest, came_begun, last_row + 1, asides)
-        self._ingest.take_block(int(times_us[heard]), *unusable, map(table.frame, refused))
+        block = RegularEpochs(*columns, newest, begun, last_row + 1, asides)
+        self._ingest.take_block(heard_us, *unusable, map(table.frame, refused))
         self._assembler.take_block(block)
         return block
+
+    def _columns(self, values: bytes, k: int) -> Columns:
+        """Columns of k epochs out of what the kernel made of them."""
+        gyros, forces = self._assembler.sensors, self._assembler.forces
+        times_us, numbers = np.frombuffer(values, np.int64, 2 * k), np.frombuffer(values)[2 * k :]
+        rates_end = k + 3 * k * gyros
+        return (
+            times_us[:k],
+            numbers[:k],
+            numbers[k:rates_end].reshape(k, gyros, 3),
+            numbers[rates_end:].reshape(k, forces, 3),
+            times_us[k:],
+        )
 
     def _lay_out(self, source: Source, info: ArrayInfo) -> None:
         wanted = (source, info, self._assembler.sensors, self._assembler.forces)

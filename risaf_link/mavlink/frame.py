@@ -5,7 +5,6 @@ How a stream is cut into frames is said in `search`. The kernel does the same wh
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,15 +43,27 @@ class Frame(Struct, frozen=True):  # a frozen dataclass takes as long to make as
     prefix: bytes = b""  # what stood before the frame, where the stream has prefixes
 
 
-@dataclass(frozen=True, slots=True)
-class FrameTable:
+class FrameTable(Struct, frozen=True):
     """Frames of one piece of a stream, without an object for each."""
 
     buffer: bytes
-    cuts: NDArray[np.void]  # CUTS, in the order of the stream
+    records: bytes  # a CUT for each, in the order of the stream
 
     def __len__(self) -> int:
-        return len(self.cuts)
+        return len(self.records) // CUT.size
+
+    @property
+    def cuts(self) -> NDArray[np.void]:
+        """The records as an array, of type CUTS."""
+        return np.frombuffer(self.records, CUTS)
+
+    @property
+    def origins(self) -> list[tuple[int, int, int]]:
+        """Message, system and component of each; of a few frames, quicker than the columns."""
+        return [
+            (message_id, system, component)
+            for _, _, message_id, _, _, system, component, *_ in CUT.iter_unpack(self.records)
+        ]
 
     @property
     def payloads(self) -> NDArray[np.int64]:
@@ -64,17 +75,17 @@ class FrameTable:
         """Give the frames of all messages but one, as they came."""
         return [
             self.buffer[start : start + HEADERS[version] + size + CHECKSUM + SIGNATURE * signed]
-            for start, _, message_id, version, *_, size, signed, _ in self.cuts.tolist()
+            for start, _, message_id, version, *_, size, signed, _ in CUT.iter_unpack(self.records)
             if message_id != but
         ]
 
     def part(self, some: slice | NDArray[np.bool_]) -> "FrameTable":
         """Some of the frames."""
-        return FrameTable(self.buffer, self.cuts[some])
+        return FrameTable(self.buffer, self.cuts[some].tobytes())
 
     def frame(self, row: int) -> Frame:
         """One of the frames."""
-        return _frame(self.buffer, self.cuts[row].item())
+        return _frame(self.buffer, CUT.unpack_from(self.records, row * CUT.size))
 
 
 class FrameParser:
@@ -115,7 +126,7 @@ class FrameParser:
 
     def receive_table(self, data: bytes) -> FrameTable:
         """Take the next bytes of the stream, as `receive_data`, for the same frames in a table."""
-        return _table(*self._cut(data))
+        return FrameTable(*self._cut(data))
 
     def end(self) -> list[Frame]:
         """Take note that the stream has ended; decide what was still open."""
@@ -123,7 +134,7 @@ class FrameParser:
 
     def end_table(self) -> FrameTable:
         """Take note that the stream has ended, as `end`, for the same frames in a table."""
-        return _table(*self._end())
+        return FrameTable(*self._end())
 
     def _cut(self, data: bytes, ended: bool = False) -> tuple[bytes, bytes]:
         """Cut what can be cut; the buffer that was cut, and the frames in it."""
@@ -144,12 +155,8 @@ class FrameParser:
         return buffer, cuts
 
 
-def _frames(buffer: bytes, cuts: bytes) -> list[Frame]:
-    return [_frame(buffer, record) for record in CUT.iter_unpack(cuts)]
-
-
-def _table(buffer: bytes, cuts: bytes) -> FrameTable:
-    return FrameTable(buffer, np.frombuffer(cuts, CUTS))
+def _frames(buffer: bytes, records: bytes) -> list[Frame]:
+    return [_frame(buffer, record) for record in CUT.iter_unpack(records)]
 
 
 def _frame(buffer: bytes, record: Any) -> Frame:

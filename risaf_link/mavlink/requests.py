@@ -191,14 +191,13 @@ class Requests:
 
     def note_traffic(self, table: FrameTable, peer: Peer) -> None:
         """Take note of all that a peer sent: what counts is what arrives."""
-        ids = table.cuts["message_id"].tolist()
-        if GYRO_ARRAY in ids and "GYRO_ARRAY" in self._encodings:
+        origins = table.origins
+        if "GYRO_ARRAY" in self._encodings and any(each[0] == GYRO_ARRAY for each in origins):
             self._array_us = self._now_us
         if self._at is None or self._order[peer[0]] > self._order[self._at[0]]:
             return
         sender, needs = self._autopilots[self._at].sender, self._autopilots[self._at].needs
-        systems, components = table.cuts["system"].tolist(), table.cuts["component"].tolist()
-        for message_id, *whose in zip(ids, systems, components, strict=True):
+        for message_id, *whose in origins:
             for need in needs:
                 if need.message_id == message_id and tuple(whose) == sender:
                     need.counts[peer] += 1

@@ -49,7 +49,7 @@ class Recording:
         stamps = np.concatenate(times_us)
         steps = np.diff(stamps.astype(np.int64), prepend=stamps[:1].astype(np.int64))
         self.times_us: Stamps = stamps[:1] + np.cumsum(np.maximum(steps, 0)).astype(np.uint64)
-        self._table = FrameTable(b"".join(pieces), np.concatenate(cuts))
+        self._table = FrameTable(b"".join(pieces), np.concatenate(cuts).tobytes())
 
     def __len__(self) -> int:
         return len(self.times_us)

@@ -46,20 +46,7 @@ class Cutter {
 };
 
 template <typename T>
-using Array = nb::ndarray<nb::numpy, T>;
-template <typename T>
 using Column = nb::ndarray<const T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-
-template <typename T>
-Array<T> made(std::initializer_list<std::size_t> shape) {
-  std::size_t size = 1;
-  for (const std::size_t length : shape) {
-    size *= length;
-  }
-  auto* values = new T[size];
-  nb::capsule owner(values, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-  return Array<T>(values, shape, owner);
-}
 
 // Whole epochs out of a table, as block.py wants them.
 class EpochFinder {
@@ -68,18 +55,19 @@ class EpochFinder {
               std::uint64_t patience_us)
       : finder_(std::move(kinds), info_id, jump_us, patience_us) {}
 
-  void load(nb::bytes buffer, Column<std::uint8_t> cuts, Column<std::uint64_t> times_us) {
+  void load(nb::bytes buffer, nb::bytes records, Column<std::uint64_t> times_us) {
     const std::size_t size = times_us.shape(0);
-    if (cuts.shape(0) != size * sizeof(risaf::Cut)) {
-      throw nb::value_error("cuts: not as many as times");
+    if (records.size() != size * sizeof(risaf::Cut)) {
+      throw nb::value_error("records: not as many as times");
     }
-    finder_.load(data(buffer), reinterpret_cast<const risaf::Cut*>(cuts.data()), times_us.data(),
+    finder_.load(data(buffer), reinterpret_cast<const risaf::Cut*>(data(records)), times_us.data(),
                  size);
     buffer_ = std::move(buffer);
-    cuts_ = std::move(cuts);
+    records_ = std::move(records);
     times_us_ = std::move(times_us);
   }
 
+  // Of the columns of an EpochBlock, first times and arrivals, int64, then what is double.
   nb::object take(const risaf::ArrayLayout& array, std::int64_t time_us, std::uint16_t sequence,
                   std::uint64_t heard_us, std::size_t most) {
     risaf::Clock clock{time_us, sequence};
@@ -88,26 +76,28 @@ class EpochFinder {
     if (size == 0) {
       return nb::none();
     }
-    auto times = made<std::int64_t>({size}), received = made<std::int64_t>({size});
-    auto dt = made<double>({size});
+    const std::size_t rates = 3 * size * array.gyros.count, forces = 3 * size * array.accels.count;
+    nb::bytes columns(nullptr, sizeof(double) * (3 * size + rates + forces));
+    auto* times = reinterpret_cast<std::int64_t*>(const_cast<void*>(columns.data()));
+    auto* dt = reinterpret_cast<double*>(times + 2 * size);
     for (std::size_t i = 0; i < size; ++i) {
-      times.data()[i] = epochs[i].time_us;
-      dt.data()[i] = static_cast<double>(epochs[i].time_us - time_us) / 1e6;
-      received.data()[i] = static_cast<std::int64_t>(times_us_.data()[epochs[i].end]);
+      times[i] = epochs[i].time_us;
+      times[size + i] = static_cast<std::int64_t>(times_us_.data()[epochs[i].end]);
+      dt[i] = static_cast<double>(epochs[i].time_us - time_us) / 1e6;
       time_us = epochs[i].time_us;
     }
-    auto rates = made<double>({size, array.gyros.count, 3});
-    auto forces = made<double>({size, array.accels.count, 3});
-    const auto of_gyros = finder_.read(array.gyros, true, rates.data());
-    const auto of_accels = finder_.read(array.accels, false, forces.data());
+    const auto of_gyros = finder_.read(array.gyros, true, dt + size);
+    const auto of_accels = finder_.read(array.accels, false, dt + size + rates);
     nb::list asides;
     for (const auto& aside : finder_.asides()) {
       asides.append(nb::make_tuple(aside.row, aside.before));
     }
     const auto& last = epochs.back();
-    return nb::make_tuple(nb::make_tuple(times, dt, rates, forces, received),
-                          nb::make_tuple(last.newest, last.begun, last.heard, last.end),
-                          clock.sequence,
+    const auto came_us = [this](std::size_t row) { return times_us_.data()[row]; };
+    return nb::make_tuple(size, columns,
+                          nb::make_tuple(came_us(last.newest), came_us(last.begun),
+                                         came_us(last.heard)),
+                          last.end, clock.sequence,
                           nb::make_tuple(of_gyros.invalid + of_accels.invalid,
                                          of_gyros.saturated + of_accels.saturated),
                           finder_.refused(), asides);
@@ -117,8 +107,7 @@ class EpochFinder {
 
  private:
   risaf::EpochFinder finder_;
-  nb::object buffer_;
-  Column<std::uint8_t> cuts_;
+  nb::object buffer_, records_;
   Column<std::uint64_t> times_us_;
 };
 
@@ -144,7 +133,7 @@ void bind_frames(nb::module_& m) {
   nb::class_<EpochFinder>(m, "EpochFinder")
       .def(nb::init<std::vector<std::uint8_t>, std::uint32_t, std::int64_t, std::uint64_t>(),
            "kinds"_a, "info_id"_a, "jump_us"_a, "patience_us"_a)
-      .def("load", &EpochFinder::load, "buffer"_a, "cuts"_a, "times_us"_a)
+      .def("load", &EpochFinder::load, "buffer"_a, "records"_a, "times_us"_a)
       .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a,
            "heard_us"_a, "most"_a)
       .def("single", &EpochFinder::single);
