@@ -413,6 +413,43 @@ def test_a_bias_that_is_not_known_yet_does_not_lock_headings_out(seed):
     assert ride.error < 5.0
 
 
+@pytest.mark.parametrize("paper", [False, True])
+@pytest.mark.parametrize("offset", [-20.0, 5.0])
+def test_an_offset_that_nobody_expects_of_gyros_is_learnt_from_the_first_headings(offset, paper):
+    ride = Ride(paper=paper)
+    ride.bias = math.radians(offset)
+    ride.go(10.0, gain=1.0).go(20.0)
+    assert ride.resets == 2
+    if not paper:  # it does not know how uncertain it is
+        assert np.mean(np.abs(ride.ratios) > 3.0) < 0.1
+    ride.forget()
+    ride.go(30.0, rate=0.1).go(30.0)
+    assert np.mean(ride.used) > 0.8
+    assert np.abs(np.degrees(ride.errors)).max() < 4.0
+    assert math.degrees(ride.state.bias_b[2]) == pytest.approx(offset, abs=0.2)
+
+
+def test_a_receiver_that_freezes_in_the_first_curve_is_not_taken_for_an_offset():
+    ride = Ride().go(5.0, gain=2.0)
+    stuck = ride.late[0][1]
+    ride.go(30.0, 0.2, spoil=lambda fix: replace(stuck, time_us=fix.time_us))
+    assert ride.resets == 1
+    assert ride.error < 5.0
+    assert abs(math.degrees(ride.state.bias_b[2])) < 0.5
+
+
+@pytest.mark.parametrize("step", [-1.0, 3.0])
+def test_an_offset_that_changes_at_once_is_believed_after_a_minute(step):
+    ride = Ride().begin()
+    ride.go(60.0)
+    ride.bias = math.radians(step)
+    ride.go(80.0)
+    ride.forget()
+    ride.go(30.0)
+    assert np.mean(ride.used) > 0.8
+    assert np.abs(np.degrees(ride.errors)).max() < 3.0
+
+
 def test_yaw_gets_less_certain_while_headings_are_refused():
     ride = Ride().begin()
     before = ride.filter.state(0).yaw_std

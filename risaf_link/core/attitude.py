@@ -17,6 +17,7 @@ from risaf_link.core.rotation import (
     Floats,
     euler_from_quaternion,
     left_matrix,
+    matrix_from_quaternion,
     rate_matrix,
     right_matrix,
     wrap,
@@ -166,6 +167,13 @@ class PaperFilter:
         covariance = self._covariance.copy()
         covariance[BIAS] = covariance[:, BIAS] = 0.0
         covariance[BIAS, BIAS] = np.diag(variance)
+        self._covariance = covariance
+
+    def doubt_bias(self, rate: float) -> None:
+        """Take the bias about the vertical for off by so much, rad/s, one standard deviation."""
+        down_b = matrix_from_quaternion(self._q)[2]
+        covariance = self._covariance.copy()
+        covariance[BIAS, BIAS] += rate**2 * np.outer(down_b, down_b)
         self._covariance = covariance
 
     def predict(self, fused: FusedRate, dt: float) -> None:

@@ -205,6 +205,11 @@ class Eskf:
         """Take a covariance for that of the error, (29, 29)."""
         self._covariance = covariance.copy()
 
+    def doubt_bias(self, rate: float) -> None:
+        """Take the bias about the vertical for off by so much, rad/s, one standard deviation."""
+        down_b = self.matrix[DOWN]
+        self._covariance[BIAS, BIAS] += rate**2 * np.outer(down_b, down_b)
+
     def memory(self, bias_walk: Floats) -> FilterMemory:
         """Tell what is known; `bias_walk`, (3,), is that of the last fused rate."""
         return FilterMemory(

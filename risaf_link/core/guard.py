@@ -12,6 +12,8 @@ that is right. So the headings are judged together.
 - Yaw is set anew by rejected headings only if they agree with one another and with the gyros, which
   is to say if they are all off by the same angle, as far as the gyros' bias is known, and if they
   do so for as long as yaw was confirmed before: ten seconds of headings do not outweigh minutes.
+  If yaw turns away from them steadily and faster than that, and has done so for a minute, or since
+  the start, the gyros' offset is larger than was presumed: it is then as uncertain as that is fast.
 - The course of a vehicle in reverse is turned round.
 - A heading of before a gap in the readings, that comes after it, does not tell what the vehicle has
   turned in the gap, and is not used; nor is one that comes before the first reading.
@@ -31,7 +33,7 @@ from risaf_link.core.attitude import UNSEEN_TURN, Innovation, PaperFilter
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.gear import STANDING_SPEED, Gear
 from risaf_link.core.heading import Heading, HeadingParameters, HeadingSource, Motion
-from risaf_link.core.rotation import Floats, wrap, wraps
+from risaf_link.core.rotation import Floats, wrap
 from risaf_link.core.track import BIAS_STD, FUSED, VALID, Track
 
 SIDE_SLIP = 0.002  # rad for each m/s^2 to the side: road and load; the rest looks like a delay
@@ -42,7 +44,8 @@ MEAN_TRUST = 2.5  # and within which they are trusted again
 LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
 BIAS_GATE = 5.0  # standard deviations by which the bias may be off, for the gyros to agree
-AGREEMENT = 0.02  # rad within which the halves of a dispute agree, besides their noise
+AGREEMENT = 0.02  # rad by which headings of a dispute may differ, besides their noise
+LARGEST_OFFSET = 0.35  # rad/s; 20 deg/s, of the cheapest gyros
 FROZEN_AFTER = 1.0  # s of one reading on the move: filtered counts may stand still on calm water
 RATES = 1024  # epochs; a second at 1 kHz
 NO_READING: Floats = np.full((1, 3), math.nan)
@@ -93,6 +96,10 @@ class Whiteness:
         """Take note that a heading was not used: those before it may have been wrong already."""
         self.doubt = max(self.doubt, abs(self._pulled))
 
+    def note_contradiction(self, innovation: Innovation) -> None:
+        """Take note of a heading that speaks against a yaw for which little speaks."""
+        self.doubt = max(self.doubt, abs(innovation.value))
+
     def pause(self) -> None:
         """Forget the innovations; what they did to yaw remains."""
         self._mean = self._pulled = 0.0
@@ -131,33 +138,27 @@ class Dispute:
         while time_s - self._rejected[0][0] > self.longest:
             self._rejected.popleft()
 
-    def is_won(self, after: float, drift: float) -> bool:
-        """Whether the headings have agreed for so many seconds that they are all off alike.
+    def drift(self, after: float, fastest: float) -> float | None:
+        """How fast yaw has turned away from headings that agree with one another, rad/s.
 
-        Parameters
-        ----------
-        after : float
-            s.
-        drift : float
-            rad/s, by which yaw may have turned away from them as long: the gyros' bias.
+        They agree if they have been on one line for `after` seconds. None: they do not, or yaw has
+        turned away faster than `fastest`, rad/s.
         """
-        last_s, last_error, _ = self._rejected[-1]
+        last_s, *_ = self._rejected[-1]
         if last_s - self._since < after:
-            return False
+            return None
         recent = np.array([row for row in self._rejected if last_s - row[0] <= after])
         times, errors, variances = recent.T
-        errors = wraps(errors - last_error)
-        older = times < last_s - after / 2.0
-        halves = [errors[older], errors[~older]]
-        if not all(map(len, halves)):
-            return False
+        if times[0] >= last_s - after / 2.0:  # they have come too seldom
+            return None
+        errors, times = np.unwrap(errors), times - times.mean()
+        errors -= errors.mean()
+        slope = float(times @ errors / (times @ times))
+        rest = float((errors - slope * times).std())
         noise = math.sqrt(float(variances.mean()))
-        apart = abs(float(halves[0].mean() - halves[1].mean()))
-        spread = math.sqrt(sum(float(half.var()) * len(half) for half in halves) / len(errors))
-        drifted = drift * after / 2.0  # from half to half
-        most_apart = AGREEMENT + 6.0 * noise / math.sqrt(len(errors)) + drifted
-        widest = AGREEMENT + 2.0 * noise + drifted / math.sqrt(12.0)
-        return apart < most_apart and spread < widest
+        uncertain = (AGREEMENT + 6.0 * noise / math.sqrt(len(errors))) / (after / 2.0)
+        agree = rest < AGREEMENT + 2.0 * noise and abs(slope) < fastest + uncertain
+        return slope if agree else None
 
 
 class HeadingGuard:
@@ -335,9 +336,17 @@ class HeadingGuard:
                     self._whiteness.note_fused(compared, measured[1])
                     return self._fuse(estimator, motion, measured, pause)
             self._dispute.add(self._elapsed, compared.value, measured[1])
-            drift = BIAS_GATE * self._bias_std
-            if self._dispute.is_won(self._patience(compared, motion.speed), drift):
+            likely = BIAS_GATE * self._bias_std
+            if self._dispute.drift(self._patience(compared, motion.speed), likely) is not None:
                 return self._set(estimator.reset_heading, measured)
+            drift = self._dispute.drift(self._despair, LARGEST_OFFSET)
+            if (
+                drift is not None and motion.is_news
+            ):  # a receiver that is frozen has a steady course
+                estimator.doubt_bias(drift)
+                return self._set(estimator.reset_heading, measured)
+            if self._is_unconfirmed:
+                self._whiteness.note_contradiction(compared)
         self._whiteness.note_refused()
         return Refused(compared.value, compared.variance, gate)
 
@@ -417,6 +426,17 @@ class HeadingGuard:
         if math.cos(compared.value) < OPPOSITE:
             return longest
         return min(max(self._confirmed, shortest), longest)
+
+    @property
+    def _is_unconfirmed(self) -> bool:
+        """Whether nothing speaks for yaw but one heading, and a presumed offset of the gyros."""
+        return self._confirmed < self._parameters.reset_after and not self._is_hearsay
+
+    @property
+    def _despair(self) -> float:
+        """Seconds after which the gyros are given up, however far their offset must be off."""
+        shortest = self._parameters.reset_after
+        return shortest if self._is_unconfirmed else LONGEST_DEFENCE * shortest
 
     def _rate_before(self, age: float) -> tuple[float, float, float]:
         """Rate `age` seconds ago, rad/s, body."""

@@ -190,6 +190,10 @@ class _Eskf:
         """Take a covariance for that of the error, (29, 29)."""
         self.kernel.set_covariance(covariance)
 
+    def doubt_bias(self, rate: float) -> None:
+        """Take the bias about the vertical for off by so much, rad/s, one standard deviation."""
+        self.kernel.doubt_bias(rate)
+
     def memory(self, bias_walk: Floats) -> FilterMemory:
         """Tell what is known; `bias_walk`, (3,), is that of the last fused rate."""
         q_nb, rate_b, *_ = self.kernel.state()

@@ -334,6 +334,15 @@ class Eskf {
     return {error, spread, gate, true, Aid::HEADING, Outcome::RESET};
   }
 
+  void doubt_bias(double rate) {
+    const Matrix matrix_nb = matrix(attitude());
+    for (std::size_t i = 0; i < 3; ++i) {
+      for (std::size_t j = 0; j < 3; ++j) {
+        covariance_[BIAS + i][BIAS + j] += rate * rate * (matrix_nb[2][i] * matrix_nb[2][j]);
+      }
+    }
+  }
+
   Corrections correct_gravity(const Gravity& gravity) {
     const auto [north, east, down] = gravity.less(force_errors_);
     const double level = std::hypot(north, east), size = std::hypot(north, east, down);

@@ -172,6 +172,7 @@ void bind_filter(nb::module_& m) {
         return told(filter.reset_heading(heading, variance, age, gate));
       })
       .def("correct_gravity", &correct_gravity)
+      .def("doubt_bias", &Eskf::doubt_bias, "rate"_a)
       .def("correct_zero_rate", [](Eskf& filter, const Three& rate, const Three& variance, bool confirmed) {
         return told(filter.correct_zero_rate(vector(rate), vector(variance), confirmed));
       })
