@@ -34,11 +34,11 @@ from risaf_link.errors import LogError
 from risaf_link.mavlink.block import BlockReader
 from risaf_link.mavlink.dialect import CRC_EXTRA, IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
-from risaf_link.mavlink.frame import Frame, FrameParser
+from risaf_link.mavlink.frame import Frame, FrameParser, FrameTable
 from risaf_link.mavlink.ingest import Ingest
 from risaf_link.mavlink.parameters import rounded
 from risaf_link.mavlink.peers import EMITTED
-from risaf_link.mavlink.signing import LinkSigning, SigningKey, SigningParameters
+from risaf_link.mavlink.signing import SETUP_SIGNING, LinkSigning, SigningKey, SigningParameters
 from risaf_link.mavlink.tlog import LEAP_US, record
 from risaf_link.publish.access import MqttParameters, MqttRates
 from risaf_link.publish.scrape import MetricsParameters
@@ -174,7 +174,7 @@ def service(data: bytes) -> None:
     for sent in all_sent:
         running.receive(sent)
     running.end()
-    _check_replay(config, all_sent, running.tracks)
+    _check_replay(config, running.recorded, running.tracks)
     last: dict[Any, int] = {}
     for (peer, raw), message in zip(
         running.sent, decoded_all(raw for _, raw in running.sent), strict=True
@@ -197,10 +197,14 @@ class Deaf(Service):
         self.steady_us = 0  # a clock that does not jump
         self.sent: list[tuple[Any, bytes]] = []
         self.tracks: list[bytes] = []
+        self.recorded: list[tuple[int, bytes]] = []
         self._outputs._leave_out = _fail
 
     def _peers(self) -> Iterator[tuple[str, str]]:
         return iter(PEERS)
+
+    def _record(self, table: FrameTable, received_us: int) -> None:
+        self.recorded += [(received_us, raw) for raw in table.raw(but=SETUP_SIGNING)]
 
     def _hand_out(self, frames: list[tuple[Any, bytes]]) -> None:
         self.sent += frames
@@ -238,15 +242,13 @@ def _fail(output: Any) -> None:
     raise AssertionError(f"{output} failed") from sys.exception()
 
 
-def _check_replay(config: Config, sent: list[Sent], tracks: list[bytes]) -> None:
+def _check_replay(config: Config, recorded: list[tuple[int, bytes]], tracks: list[bytes]) -> None:
     """A recording gives the same estimates, unless its stamps are such as no log has."""
-    times_us = [each.received_us for each in sent]
-    steps_us = [after - before for before, after in pairwise(times_us)]
-    if not sent or not all(0 <= step <= LEAP_US for step in steps_us):
+    steps_us = [after - before for (before, _), (after, _) in pairwise(recorded)]
+    if not recorded or not all(0 <= step <= LEAP_US for step in steps_us):
         return
     path = ROOM / "recorded.tlog"
-    taken = [each for each in sent if each.name != "SETUP_SIGNING"]
-    path.write_bytes(b"".join(record(each.received_us, each.raw) for each in taken))
+    path.write_bytes(b"".join(record(*each) for each in recorded))
     blocks, again = Replay(config, path, Selection()).blocks(), []
     with suppress(LogError):  # it may hold nothing that can be used
         again += [block.track.values.tobytes() for block in blocks]
