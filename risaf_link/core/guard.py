@@ -45,6 +45,7 @@ LONGEST_DEFENCE = 6.0  # times `reset_after` for which a yaw is defended at most
 OPPOSITE = -math.sqrt(0.5)  # cosine of an innovation beyond which a heading is opposite to yaw
 BIAS_GATE = 5.0  # standard deviations by which the bias may be off, for the gyros to agree
 AGREEMENT = 0.02  # rad by which headings of a dispute may differ, besides their noise
+MANY = 6  # headings that are no line by chance
 LARGEST_OFFSET = 0.35  # rad/s; 20 deg/s, of the cheapest gyros
 FROZEN_AFTER = 1.0  # s of one reading on the move: filtered counts may stand still on calm water
 RATES = 1024  # epochs; a second at 1 kHz
@@ -138,18 +139,18 @@ class Dispute:
         while time_s - self._rejected[0][0] > self.longest:
             self._rejected.popleft()
 
-    def drift(self, after: float, fastest: float) -> float | None:
+    def drift(self, after: float, fastest: float, fewest: int = 2) -> float | None:
         """How fast yaw has turned away from headings that agree with one another, rad/s.
 
         They agree if they have been on one line for `after` seconds. None: they do not, or yaw has
-        turned away faster than `fastest`, rad/s.
+        turned away faster than `fastest`, rad/s, or fewer than `fewest` have come.
         """
         last_s, *_ = self._rejected[-1]
         if last_s - self._since < after:
             return None
         recent = np.array([row for row in self._rejected if last_s - row[0] <= after])
         times, errors, variances = recent.T
-        if times[0] >= last_s - after / 2.0:  # they have come too seldom
+        if len(times) < fewest or times[0] >= last_s - after / 2.0:
             return None
         errors, times = np.unwrap(errors), times - times.mean()
         errors -= errors.mean()
@@ -336,14 +337,9 @@ class HeadingGuard:
                     self._whiteness.note_fused(compared, measured[1])
                     return self._fuse(estimator, motion, measured, pause)
             self._dispute.add(self._elapsed, compared.value, measured[1])
-            likely = BIAS_GATE * self._bias_std
-            if self._dispute.drift(self._patience(compared, motion.speed), likely) is not None:
-                return self._set(estimator.reset_heading, measured)
-            drift = self._dispute.drift(self._despair, LARGEST_OFFSET)
-            if (
-                drift is not None and motion.is_news
-            ):  # a receiver that is frozen has a steady course
-                estimator.doubt_bias(drift)
+            offset = self._offset_if_lost(compared, motion)
+            if offset is not None:
+                estimator.doubt_bias(offset)
                 return self._set(estimator.reset_heading, measured)
             if self._is_unconfirmed:
                 self._whiteness.note_contradiction(compared)
@@ -426,6 +422,16 @@ class HeadingGuard:
         if math.cos(compared.value) < OPPOSITE:
             return longest
         return min(max(self._confirmed, shortest), longest)
+
+    def _offset_if_lost(self, compared: Innovation, motion: Motion) -> float | None:
+        """If yaw has lost the dispute, how far the gyros' bias must be off, rad/s; else None."""
+        likely = BIAS_GATE * self._bias_std
+        if self._dispute.drift(self._patience(compared, motion.speed), likely) is not None:
+            return 0.0
+        drift = self._dispute.drift(self._despair, LARGEST_OFFSET, fewest=MANY)
+        if drift is None or abs(drift) <= likely:
+            return None
+        return drift if motion.is_news else None  # the course of a frozen receiver is steady, too
 
     @property
     def _is_unconfirmed(self) -> bool:
