@@ -16,7 +16,7 @@ from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.epoch import ArrayParameters, EpochAssembler, GyroChunk
 from risaf_link.mavlink.frame import FrameParser, encode
 from risaf_link.mavlink.ingest import GpsParameters, Ingest
-from risaf_link.mavlink.truth import truth_of
+from risaf_link.mavlink.truth import truth_of, truths_in
 
 G = 9.80665
 SECOND = 1_000_000
@@ -582,6 +582,16 @@ class TestTruth:
         quaternion = [1.0, 0.0, 0.0, angle]
         assert truth_of(frame("HIL_STATE_QUATERNION", attitude_quaternion=quaternion)) is None
         assert truth_of(frame("HIL_STATE_QUATERNION")) is None
+
+    def test_a_nan_that_signals_is_no_number_either(self):
+        q_nb, signalling = [0.5, -0.5, 0.5, 0.5], b"\x01\x00\xa0\x7f"
+        good = frame("HIL_STATE_QUATERNION", time_usec=8, attitude_quaternion=q_nb)
+        payload = good.payload[:8] + 4 * signalling + good.payload[24:]
+        raws = encode(good.message_id, payload, 0, 1, 1), good.raw
+        table = FrameParser().receive_table(b"".join(raws))
+        (truths,) = truths_in(table, np.array([1, 2], np.uint64))
+        assert truths.q_nb.tolist() == [q_nb]
+        assert truths.received_us.tolist() == [2]
 
 
 READ = [

@@ -66,11 +66,11 @@ def truths_in(table: FrameTable, times_us: Stamps) -> Iterator[Truths]:
     starts = table.payloads[whole]
     payloads = np.frombuffer(table.buffer, np.uint8)[starts[:, None] + np.arange(HIL_HEAD.itemsize)]
     heads = payloads.view(HIL_HEAD)[:, 0]
-    q_nb = heads["q_nb"].astype(float)
-    stated = np.isfinite(q_nb).all(axis=1) & q_nb.any(axis=1)
+    stated = np.isfinite(heads["q_nb"]).all(axis=1)
+    stated[stated] = heads["q_nb"][stated].any(axis=1)
     received_us = times_us[whole][stated]
-    sent_us = heads["time_us"][stated].astype(float)
-    yield Truths(sent_us, received_us, q_nb[stated], True, name_of(HIL_STATE))
+    sent_us, q_nb = (heads[name][stated].astype(float) for name in ("time_us", "q_nb"))
+    yield Truths(sent_us, received_us, q_nb, True, name_of(HIL_STATE))
     others = np.isin(ids, [HIL_STATE, *_SIM_STATES]) & ~whole
     for row in np.flatnonzero(others).tolist():
         truth = truth_of(table.frame(row))
