@@ -30,7 +30,15 @@ from msgspec.structs import replace as set_parameters
 
 from risaf_link.core.aiding import Aiding
 from risaf_link.core.earth import EARTH_RATE, GRAVITY
-from risaf_link.core.error_state import ACCELEROMETER, ATTITUDE, STATES, Gravity, Outcome, drive
+from risaf_link.core.error_state import (
+    ACCELEROMETER,
+    ATTITUDE,
+    BIAS,
+    STATES,
+    Gravity,
+    Outcome,
+    drive,
+)
 from risaf_link.core.eskf import Eskf
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import (
@@ -318,6 +326,19 @@ def test_every_reset_is_counted_and_its_value_is_the_change():
         assert after.euler[:2] == pytest.approx(before.euler[:2])
 
 
+def test_a_bias_in_doubt_is_less_certain_about_the_vertical_and_nowhere_else():
+    estimator = settled_filter()
+    estimator.set_attitude(quaternion_from_euler(0.4, -0.7, 2.0))
+    before, rate = estimator.covariance, math.radians(5.0)
+    estimator.doubt_bias(rate)
+    added = estimator.covariance - before
+    down_b = estimator.matrix[2]
+    assert added[BIAS, BIAS] == pytest.approx(rate**2 * np.outer(down_b, down_b))
+    added[BIAS, BIAS] = 0.0
+    assert not added.any()
+    assert_sound(estimator)
+
+
 @given(
     roll=st.floats(-math.pi, math.pi),
     pitch=st.one_of(
@@ -436,7 +457,7 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
         shaken_n = -DOWN + 0.3 * generator.normal(size=3)
         force_b = truth_nb.T @ shaken_n
         force_b = force_b + force_scale @ force_b + force_bias
-        by_errors = drive(estimator.matrix, GRAVITY * estimator.up_b)
+        by_errors = drive(estimator.matrix, -GRAVITY * estimator.matrix[2])
         gravity = Gravity(-estimator.matrix @ force_b, 0.09, 0.09, by_errors=by_errors)
         corrections += estimator.correct_gravity(gravity)
         if step % 2 == 0:
@@ -458,7 +479,8 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
                 ]
             )
             wrong = np.concatenate((bias, scale.ravel(), force_bias, force_scale.ravel()))
-            error = np.concatenate((angles / 2, wrong - estimator.known_errors))
+            known = estimator.memory(np.zeros(3)).errors[: len(wrong)]
+            error = np.concatenate((angles / 2, wrong - known))
             covariance = estimator.covariance[:SIMULATED, :SIMULATED]
             nees.append(error @ np.linalg.solve(covariance, error))
             if step % 200 == 199:
@@ -467,7 +489,7 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
 
 
 @pytest.fixture(scope="module")
-def honesty():
+def honesty(filter_form):  # of either form
     parameters = set_parameters(
         DEFAULTS,
         turn_error=0.0,
