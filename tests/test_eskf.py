@@ -489,7 +489,7 @@ def simulate(seed, parameters, seconds=60.0, dt=0.1):
 
 
 @pytest.fixture(scope="module")
-def honesty(filter_form):  # of either form
+def honesty(filter_form):  # noqa: ARG001 which form is run is its doing
     parameters = set_parameters(
         DEFAULTS,
         turn_error=0.0,
