@@ -158,7 +158,7 @@ class Pipeline:
         return [estimate for block in blocks for estimate in block]
 
     def flush(self, received_us: int) -> list[EstimateBlock]:
-        """Use what is left when the links, or a log, have ended."""
+        """Use what is left when the links, a log or a source of samples have ended."""
         self._wait(self.assembler.flush(), received_us)
         return self.release()
 
@@ -171,6 +171,8 @@ class Pipeline:
         self._clock.hear(frame, received_us)
         datum = self.ingest.decode(frame, received_us)
         if isinstance(datum, GyroChunk):
+            if datum.source != self.assembler.source:
+                blocks += self.flush(received_us)  # their samples are as late as that source's
             self._wait(self.assembler.add(datum), received_us)
         elif isinstance(datum, GpsFix):
             self._correct(datum)

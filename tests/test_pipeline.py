@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as public
 from vehicle import Vehicle
-from wire import array, debug_array, imu, info
+from wire import array, debug_array, frame, imu, info
 
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.heading import HeadingState
@@ -166,6 +166,21 @@ def test_estimates_are_stamped_when_late_samples_were_taken_and_never_go_back(dr
     assert stamps[90] % PERIOD_US == 0
     assert stamps[-1] == drive.time_us - 56_270
     assert stamps == sorted(stamps)
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_epochs_are_as_late_as_their_own_source_when_another_takes_its_place(together):
+    pipeline = Pipeline(PipelineParameters(), OWN)
+    read_us = [5_000_000 + 20_000 * k for k in range(5)]
+    imus = [imu("RAW_IMU", time_us) for time_us in read_us]
+    blocks = []
+    for one in (frame("HEARTBEAT", **ROVER), info(), *imus, array(5_100_000, 3 * [(0, 0, 1)])):
+        blocks += pipeline.gather(one, 6_000_000)
+        blocks += [] if together else pipeline.release()
+    blocks += pipeline.flush(6_000_000)
+    *filtered, raw = np.concatenate([block.boot_us for block in blocks]).tolist()
+    assert filtered == [time_us - 56_270 for time_us in read_us]  # 4 Hz, as ArduPilot's rovers
+    assert raw == 5_100_000
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05])
