@@ -60,7 +60,6 @@ def test_the_kernel_s_filter_is_that_of_the_python_form(seed):
                 aid.speed.hear(speed, 0.01, 0.11)
             if step % 2900 == 2899:
                 made.append(estimator.reset_heading(wrap(course), 4e-4, 0.11, 3.0))
-                estimator.doubt_bias(0.05)
             corrections.append(made)
         for python, native in zip(*corrections, strict=True):
             if python is None:
