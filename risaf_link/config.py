@@ -271,11 +271,11 @@ def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = C
     for odd in _with_backtick(tree):
         known = _names(_kinds_at(schema, odd[:-1]), of_key=True)
         if known:
-            return f"{'.'.join(odd)}: unknown key; known: {', '.join(known)}"
-    message, place = str(error), re.search(r" - at (`key` in )?`\$([^`]*)`\Z", str(error))
+            return _unknown(".".join(odd), known)
+    message = str(error)
+    place = re.search(r" - at (`key` in )?`\$([^`]*)`\Z", message)
     of_key, path = place.groups() if place else ("", "")
-    if place:
-        message = message[: place.start()]
+    message = message[: place.start()] if place else message
     steps = re.findall(r"\w+|\.\.\.", path)
     if "..." in steps:
         steps[steps.index("...")] = _culprit(error, tree, steps, schema)
@@ -285,17 +285,22 @@ def _explain(error: msgspec.ValidationError, tree: Any, schema: type[Struct] = C
         key = ".".join([*steps, field_name[1]])
         if message.startswith("Object missing"):
             return f"{key}: found nothing, expected a value"
-        return f"{key}: unknown key; known: {', '.join(_names(kinds, of_key=True))}"
+        return _unknown(key, _names(kinds, of_key=True))
     key = ".".join(steps)
     if of_key:
-        found = next(iter(set(_value_at(tree, steps)) - set(_names(kinds, of_key=True))))
-        return f"{key}.{found}: unknown key; known: {', '.join(_names(kinds, of_key=True))}"
+        known = _names(kinds, of_key=True)
+        found = next(iter(set(_value_at(tree, steps)) - set(known)))
+        return _unknown(f"{key}.{found}", known)
     found = _value_at(tree, steps)
     if message.startswith("Invalid enum"):
         expected = f"one of {', '.join(_names(kinds, of_key=False))}"
     else:
         expected = re.sub(r"^Expected |`|, got .*$", "", message).replace("null", "nothing")
     return f"{key}: found {_short(found)}, expected {expected}"
+
+
+def _unknown(key: str, known: list[str]) -> str:
+    return f"{key}: unknown key; known: {', '.join(known)}"
 
 
 def _with_backtick(tree: Any, place: tuple[str, ...] = ()) -> Iterator[list[str]]:

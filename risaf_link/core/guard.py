@@ -416,7 +416,7 @@ class HeadingGuard:
         at once.
         """
         shortest = self._parameters.reset_after
-        longest = LONGEST_DEFENCE * shortest
+        longest = self._dispute.longest
         if speed < STANDING_SPEED or self._is_hearsay:
             return shortest
         if math.cos(compared.value) < OPPOSITE:
@@ -428,10 +428,10 @@ class HeadingGuard:
         likely = BIAS_GATE * self._bias_std
         if self._dispute.drift(self._patience(compared, motion.speed), likely) is not None:
             return 0.0
-        drift = self._dispute.drift(self._despair, LARGEST_OFFSET, fewest=MANY)
-        if drift is None or abs(drift) <= likely:
+        if not motion.is_news:  # the course of a frozen receiver is steady, too
             return None
-        return drift if motion.is_news else None  # the course of a frozen receiver is steady, too
+        drift = self._dispute.drift(self._despair, LARGEST_OFFSET, fewest=MANY)
+        return drift if drift is not None and abs(drift) > likely else None
 
     @property
     def _is_unconfirmed(self) -> bool:
@@ -441,8 +441,7 @@ class HeadingGuard:
     @property
     def _despair(self) -> float:
         """Seconds after which the gyros are given up, however far their offset must be off."""
-        shortest = self._parameters.reset_after
-        return shortest if self._is_unconfirmed else LONGEST_DEFENCE * shortest
+        return self._parameters.reset_after if self._is_unconfirmed else self._dispute.longest
 
     def _rate_before(self, age: float) -> tuple[float, float, float]:
         """Rate `age` seconds ago, rad/s, body."""
