@@ -462,13 +462,13 @@ class TestNotices:
         return heard
 
     def status(self, state, **changes):
-        return replace(ESTIMATE.heading, state=state, **changes)
+        return structs.replace(ESTIMATE.heading, state=state, **changes)
 
     def test_a_quiet_drive_says_nothing(self, network):
         assert self.told(network, 20) == []
 
     def test_alignment_outage_and_return(self, network):
-        aligned = replace(ESTIMATE.attitude, aligned=True, resets=1)
+        aligned = structs.replace(ESTIMATE.attitude, aligned=True, resets=1)
         on = {"attitude": aligned, "heading": self.status(HeadingState.FUSING)}
         out = {"attitude": aligned, "heading": self.status(HeadingState.DEAD_RECKONING)}
         assert self.told(network, **on) == ["heading aligned: 0 deg"]
@@ -476,7 +476,7 @@ class TestNotices:
         assert self.told(network, **on) == ["GPS is back"]
 
     def test_after_a_restart_it_is_told_when_the_heading_is_aligned_again(self, network):
-        aligned = replace(ESTIMATE.attitude, aligned=True, resets=1)
+        aligned = structs.replace(ESTIMATE.attitude, aligned=True, resets=1)
         self.told(network, attitude=aligned)
         assert self.told(network) == []
         assert self.told(network, attitude=aligned) == ["heading aligned: 0 deg"]
@@ -511,7 +511,7 @@ class TestNotices:
         assert self.told(network) == ["all sensors are back"]
 
     def test_what_flickers_is_told_at_most_every_five_seconds(self, network):
-        aligned = replace(ESTIMATE.attitude, aligned=True, resets=0)
+        aligned = structs.replace(ESTIMATE.attitude, aligned=True, resets=0)
         said = []
         for k in range(40):
             state = HeadingState.DEAD_RECKONING if k % 2 else HeadingState.FUSING

@@ -2,10 +2,10 @@
 
 import math
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from msgspec.structs import replace as set_parameters
 
 from risaf_link.core.attitude import AttitudeParameters, Innovation, PaperFilter

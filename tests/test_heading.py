@@ -1,11 +1,11 @@
 """Headings from fixes whose course is known, and the account of what came of them."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from ellipsoid import away, earth_centred, north_east
+from msgspec.structs import replace
 from numpy import zeros
 
 from risaf_link.core.attitude import AttitudeState, Innovation
@@ -139,7 +139,7 @@ def test_a_receiver_with_one_antenna_is_not_waited_for():
 def test_below_the_least_speed_there_is_no_course(source):
     headings = finder(source, min_speed=3.0)
     slow = headings.take(replace(FIX, speed=2.99), 0.0)
-    assert slow == Motion(2.99, None)
+    assert (slow.speed, slow.heading) == (2.99, None)
     assert headings.take(replace(FIX, speed=3.0), 0.2).heading is not None
 
 
@@ -160,7 +160,7 @@ def test_two_antennas_need_no_speed(source):
 
 def test_dual_antenna_waits_while_auto_falls_back_on_velocity_and_positions():
     without_yaw = replace(FIX, yaw=NAN)
-    assert finder("dual_antenna").take(without_yaw, 0.0) == Motion(10.0, None)
+    assert finder("dual_antenna").take(without_yaw, 0.0).heading is None
     assert finder("auto").take(without_yaw, 0.0).heading.source is HeadingSource.VELOCITY
     by_positions = drive(finder("auto"), PARAN, 0.5)
     assert by_positions.heading.source is HeadingSource.POSITIONS
@@ -222,7 +222,7 @@ def test_a_way_is_as_good_as_its_length_and_the_receivers_noise_make_it(position
 def test_the_speed_that_gates_a_way_is_that_between_its_points():
     headings = finder("positions", min_speed=5.0)
     slow = drive(headings, PARAN, 1.0, distance=0.9, speed=30.0, course=0.0)
-    assert slow == Motion(pytest.approx(4.5, rel=1e-3), None)
+    assert (slow.speed, slow.heading) == (pytest.approx(4.5, rel=1e-3), None)
     fast = drive(headings, PARAN, 1.0, distance=1.1, speed=0.0, course=0.0)
     assert fast.heading.heading == pytest.approx(1.0, abs=1e-5)
 
@@ -233,7 +233,8 @@ def test_one_position_alone_and_one_that_has_not_moved_have_no_direction(source)
     first = headings.take(at(PARAN, 0.0), 0.0)
     assert math.isnan(first.speed)
     assert first.heading is None
-    assert headings.take(at(PARAN, 0.2), 0.0) == Motion(0.0, None)
+    second = headings.take(at(PARAN, 0.2), 0.0)
+    assert (second.speed, second.heading) == (0.0, None)
 
 
 @pytest.mark.parametrize("seconds", [2.1, 0.0, -0.2])

@@ -7,13 +7,13 @@ import io
 import math
 import re
 from copy import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from autopilots import ArduPilot, Px4, yaw_of
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from network import NEAR, OWN, Network, acks, of, public, texts
 from streams import ROOT, recording
 from vehicle import Vehicle

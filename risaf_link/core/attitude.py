@@ -6,11 +6,10 @@ here are theirs.
 """
 
 import math
-from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from risaf_link.core.fusion import FusedRate
 from risaf_link.core.rotation import (
@@ -76,8 +75,7 @@ class AttitudeParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """eskf: of rest that contradicts the bias until the bias is taken to be wrong."""
 
 
-@dataclass(frozen=True, slots=True)
-class AttitudeState:
+class AttitudeState(Struct, frozen=True):
     """The filter's estimate at one epoch."""
 
     time_us: int
@@ -107,8 +105,7 @@ class AttitudeState:
         return euler_from_quaternion(self.q_nb)
 
 
-@dataclass(frozen=True, slots=True)
-class Innovation:
+class Innovation(Struct, frozen=True):
     """What came of one measurement."""
 
     value: float  # measured minus predicted

@@ -42,8 +42,7 @@ class Outcome(IntEnum):
     """A heading while the vehicle points up or down."""
 
 
-@dataclass(frozen=True, slots=True)
-class Correction(Innovation):
+class Correction(Innovation, frozen=True):
     """An innovation, and what came of it."""
 
     source: str = ""

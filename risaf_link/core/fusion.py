@@ -111,8 +111,7 @@ class EpochBlock(Struct, frozen=True):  # as those that come of it: live, it is 
         )
 
 
-@dataclass(frozen=True, slots=True)
-class FusedRate:
+class FusedRate(Struct, frozen=True):
     """The array as one gyro."""
 
     time_us: int

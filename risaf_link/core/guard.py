@@ -25,7 +25,6 @@ that is right. So the headings are judged together.
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -60,8 +59,7 @@ Measured = tuple[float, float, float]
 """rad, rad^2, s ago: a heading of the vehicle."""
 
 
-@dataclass(frozen=True, slots=True)
-class Refused(Innovation):
+class Refused(Innovation, frozen=True):
     """An innovation that was not used, though it may be within the gate."""
 
     @property

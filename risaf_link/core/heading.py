@@ -6,7 +6,6 @@ Massive Array of MEMS IMUs".
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Annotated, Literal
 
@@ -85,8 +84,7 @@ class HeadingSource(IntEnum):
     DUAL_ANTENNA = 4
 
 
-@dataclass(frozen=True, slots=True)
-class GpsFix:
+class GpsFix(Struct, frozen=True):
     """One report of a GPS receiver. NaN: not known."""
 
     time_us: int  # on the sender's clock; 0: not known
@@ -103,8 +101,7 @@ class GpsFix:
     course_is_heading: bool = True  # so far as its sender tells: of a vehicle that hovers it is not
 
 
-@dataclass(frozen=True, slots=True)
-class Heading:
+class Heading(Struct, frozen=True):
     """One measurement of heading."""
 
     heading: float  # rad from true north, in (-pi, pi]
@@ -113,16 +110,15 @@ class Heading:
     age: float = 0.0  # s before the fix at which it was valid
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(Struct, frozen=True):
     """What one fix says about the vehicle's motion."""
 
     speed: float  # m/s over ground, NaN: not known
     heading: Heading | None  # None: too slow, or nothing to make it from
     speed_std: float = UNKNOWN_SPEED_STD  # m/s
-    course: float = field(default=math.nan, compare=False)  # rad; NaN: too slow, or not known
+    course: float = math.nan  # rad; NaN: too slow, or not known
     along: bool = True  # the vehicle goes where it points, or backwards
-    is_news: bool = field(default=True, compare=False)  # it differs from the fix before
+    is_news: bool = True  # it differs from the fix before
     contradicted: bool = False  # by the receiver's own positions
     polar: bool = False  # so near to a pole that north does not stay where it is
 
@@ -305,8 +301,7 @@ States = tuple[HeadingState, HeadingState]
 WITHOUT_FIX: States = (HeadingState.NO_FIX, HeadingState.DEAD_RECKONING)
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingStatus:
+class HeadingStatus(Struct, frozen=True):
     """GPS heading, and what came of it, at one epoch."""
 
     time_us: int

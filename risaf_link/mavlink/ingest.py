@@ -7,11 +7,11 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from risaf_link.core.heading import GpsFix
 from risaf_link.core.rotation import Floats
@@ -381,7 +381,7 @@ class Ingest:
             self.counts["other_source"] += 1
             return None
         if self._sideways.get(frame.system, False):
-            return replace(fix, course_is_heading=False)
+            return structs.replace(fix, course_is_heading=False)
         return fix
 
     def _is_repeated(self, receiver: Hashable, fix: GpsFix, payload: bytes) -> bool:
