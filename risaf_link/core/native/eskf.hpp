@@ -10,6 +10,7 @@
 
 #include "fused.hpp"
 #include "rotation.hpp"
+#include "row.hpp"
 
 namespace risaf {
 
@@ -201,6 +202,7 @@ class Eskf {
   void set_latitude(double latitude) {
     if (std::abs(latitude) <= PI / 2.0) {
       latitude_ = latitude;
+      earth_ = {c.EARTH_RATE * std::cos(latitude), 0.0, -c.EARTH_RATE * std::sin(latitude)};
     }
   }
 
@@ -232,7 +234,7 @@ class Eskf {
     std::copy_n(errors + 3, 9, scale_.begin());
     std::copy_n(errors + ERRORS, ERRORS, force_errors_.begin());
     std::copy_n(errors + 2 * ERRORS, 2, wrong_.begin());
-    latitude_ = latitude;
+    set_latitude(latitude);
     aligned_ = aligned;
     levelled_ = levelled;
     resets_ = resets;
@@ -506,16 +508,7 @@ class Eskf {
         turned_nb[i][j] = drive_nb[i][j] * told;
       }
     }
-    for (std::size_t i = 0; i < 3; ++i) {
-      double* const row = covariance_[i];
-      for (std::size_t k = 0; k < ERRORS; ++k) {
-        const double by = turned_nb[i][k];
-        const double* const error = covariance_[GYRO + k];
-        for (std::size_t j = 0; j < PADDED; ++j) {
-          row[j] -= by * error[j];
-        }
-      }
-    }
+    carry(turned_nb);
     const auto [angle, walk] = noise(fused, unseen, told, dt);
     Matrix among;
     for (std::size_t i = 0; i < 3; ++i) {
@@ -535,12 +528,12 @@ class Eskf {
         covariance_[i][j] = (among[i][j] + among[j][i]) / 2.0;
       }
     }
-    forget(dt);
     for (std::size_t j = 3; j < STATES; ++j) {
       for (std::size_t i = 0; i < 3; ++i) {
         covariance_[j][i] = covariance_[i][j];
       }
     }
+    forget(dt);
     for (std::size_t i = 0; i < 3; ++i) {
       covariance_[BIAS + i][BIAS + i] += walk[i];
     }
@@ -550,6 +543,22 @@ class Eskf {
     bound();
   }
 
+  // Rows of the attitude's error, of which the gyro's errors have turned some part.
+  RISAF_FAST void carry(const ByErrors& turned_nb) {
+    for (std::size_t i = 0; i < 3; ++i) {
+      double row[PADDED];
+      std::copy_n(covariance_[i], PADDED, row);
+      for (std::size_t k = 0; k < ERRORS; ++k) {
+        const double by = turned_nb[i][k];
+        const double* const error = covariance_[GYRO + k];
+        for (std::size_t j = 0; j < PADDED; ++j) {
+          row[j] -= by * error[j];
+        }
+      }
+      std::copy_n(row, PADDED, covariance_[i]);
+    }
+  }
+
   // What is wrong with the headings becomes another.
   void forget(double dt) {
     if (dt != kept_dt_) {
@@ -557,15 +566,16 @@ class Eskf {
       kept_dt_ = dt;
     }
     for (std::size_t k = 0; k < 2; ++k) {
-      wrong_[k] *= kept_[k];
+      const double kept = kept_[k];
       double* const row = covariance_[OFFSET + k];
-      for (std::size_t j = 0; j < STATES; ++j) {
-        covariance_[j][OFFSET + k] *= kept_[k];
+      wrong_[k] *= kept;
+      for (std::size_t j = 0; j < PADDED; ++j) {
+        row[j] *= kept;
       }
+      row[OFFSET + k] = row[OFFSET + k] * kept + wrong_variance_[k] * (1.0 - kept * kept);
       for (std::size_t j = 0; j < STATES; ++j) {
-        row[j] = j == OFFSET + k ? row[j] * kept_[k] : covariance_[j][OFFSET + k];
+        covariance_[j][OFFSET + k] = row[j];
       }
-      row[OFFSET + k] += wrong_variance_[k] * (1.0 - kept_[k] * kept_[k]);
     }
   }
 
@@ -616,18 +626,11 @@ class Eskf {
   }
 
   Vector earth_rate() const {
-    if (std::isnan(latitude_)) {
-      return {};
-    }
-    const double north = aligned_ ? c.EARTH_RATE * std::cos(latitude_) : 0.0;
-    return {north, 0.0, -c.EARTH_RATE * std::sin(latitude_)};
+    return {aligned_ ? earth_[0] : 0.0, earth_[1], earth_[2]};
   }
 
   void doubt_bias_for_earth_rate() {
-    if (std::isnan(latitude_)) {
-      return;
-    }
-    const double level = c.EARTH_RATE * std::cos(latitude_);
+    const double level = earth_[0];
     const Matrix matrix_nb = matrix(attitude());
     for (std::size_t i = 0; i < 3; ++i) {
       for (std::size_t j = 0; j < 3; ++j) {
@@ -858,6 +861,7 @@ class Eskf {
   FilterNumbers c;
   Quaternion by_rate_, correction_;
   Vector bias_{}, rate_{}, unseen_{}, turned_{}, shaken_{};
+  Vector earth_{};  // rad/s, ned; none until the latitude is known
   double usual_ = 0.0;
   bool in_gap_ = false;
   std::array<double, 9> scale_{};
