@@ -180,6 +180,8 @@ class Pipeline:
 
     def release(self) -> list[EstimateBlock]:
         """Use the epochs that wait."""
+        if not self._waiting:
+            return []
         waiting, self._waiting = self._waiting, []
         same_array = groupby(waiting, lambda each: (each[0].rates_b.shape, each[0].forces_b.shape))
         groups = (self._advance(EpochBlock.of(list(epochs))) for _, epochs in same_array)

@@ -4,9 +4,10 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from risaf_link.pipeline import Pipeline
 from risaf_link.remembered import memory_file
 
 LOG: Peer = ("log", "")
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -208,7 +210,7 @@ class Replay:
         """Frames and times of what was selected."""
         first_us: int | None = None
         self._reader = TlogReader(read(self._path, progress))
-        for table, times_us in self._reader.tables():
+        for table, times_us in _ahead(self._reader.tables()):
             first_us = int(times_us[0]) if first_us is None else first_us
             log_time = (times_us.astype(np.int64) - first_us) / 1e6
             late = log_time > self._selection.end
@@ -281,6 +283,15 @@ class Replay:
             f"{self._path}: found {self._frames} frames but no gyro samples, expected one of "
             "GYRO_ARRAY (with IMU_ARRAY_INFO), DEBUG_FLOAT_ARRAY, HIGHRES_IMU, RAW_IMU, SCALED_IMU"
         )
+
+
+def _ahead(items: Iterator[T]) -> Iterator[T]:
+    """Look for the next one in another thread, while one is used."""
+    with ThreadPoolExecutor(1) as executor:
+        coming = executor.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = executor.submit(next, items, None)
+            yield item
 
 
 def _singly(table: FrameTable, times_us: Stamps) -> Iterator[tuple[Frame, int]]:

@@ -42,7 +42,7 @@ class Gear:
     def feel(self, ahead: Floats, dt: Floats) -> None:
         """Use what k epochs felt ahead, (k,) m/s^2; NaN: there is no accelerometer."""
         for force, seconds in zip(ahead.tolist(), dt.tolist(), strict=True):
-            if abs(force) < LARGEST_FORCE:
+            if -LARGEST_FORCE < force < LARGEST_FORCE:
                 self._felt += force * seconds
             else:
                 self._begun = None

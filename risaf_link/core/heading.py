@@ -123,6 +123,9 @@ class Motion(Struct, frozen=True):
     polar: bool = False  # so near to a pole that north does not stay where it is
 
 
+UNKNOWN_TRACK = Motion(math.nan, None)
+
+
 class PositionWitness:
     """Holds a receiver's velocity against its own positions, over some seconds.
 
@@ -204,9 +207,12 @@ class HeadingFinder:
         time_s : float
             When it came, seconds; stands in where the fix itself has no time.
         """
-        previous = self._previous[0] if self._previous else None
-        track = self._track(fix, time_s)
-        by_track = self._parameters.source.startswith("positions") or math.isnan(fix.speed)
+        previous, self._previous = self._previous, (fix, time_s)
+        by_positions = self._parameters.source.startswith("positions")
+        track = UNKNOWN_TRACK
+        if by_positions or not (math.isfinite(fix.speed) and math.isfinite(fix.course)):
+            track = self._track(previous, fix, time_s)
+        by_track = by_positions or math.isnan(fix.speed)
         polar = abs(fix.latitude) > POLAR_CAP
         heading = self._choose(fix, track, time_s)
         return Motion(
@@ -215,7 +221,7 @@ class HeadingFinder:
             track.speed_std if by_track else _known(fix.speed_std, UNKNOWN_SPEED_STD),
             fix.course if fix.speed >= self._parameters.min_speed else math.nan,
             self._goes_ahead(fix),
-            previous is None or _content(fix) != _content(previous),
+            previous is None or _content(fix) != _content(previous[0]),
             self._witness.contradicts(fix, time_s),
             polar,
         )
@@ -250,11 +256,10 @@ class HeadingFinder:
         std = max(fix.course_std, across) if told else across
         return _heading(fix.course, std, HeadingSource.VELOCITY)
 
-    def _track(self, fix: GpsFix, time_s: float) -> Motion:
+    def _track(self, previous: tuple[GpsFix, float] | None, fix: GpsFix, time_s: float) -> Motion:
         """Speed and heading from the previous position to this one."""
-        previous, self._previous = self._previous, (fix, time_s)
         if previous is None:
-            return Motion(math.nan, None)
+            return UNKNOWN_TRACK
         before, before_s = previous
         timed = fix.time_us and before.time_us
         elapsed = (fix.time_us - before.time_us) / 1e6 if timed else time_s - before_s
@@ -264,7 +269,7 @@ class HeadingFinder:
         north, east = float(per_north * turned_north), float(per_east * turned_east)
         distance = math.hypot(north, east)
         if not 0 < elapsed <= self._parameters.timeout or not math.isfinite(distance):
-            return Motion(math.nan, None)
+            return UNKNOWN_TRACK
         speed = distance / elapsed
         if speed < self._parameters.min_speed or distance == 0.0:
             return Motion(speed, None)

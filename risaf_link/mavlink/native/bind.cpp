@@ -5,6 +5,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <map>
+#include <optional>
 
 #include "epochs.hpp"
 #include "frames.hpp"
@@ -33,7 +34,12 @@ class Cutter {
   nb::tuple cut(const nb::bytes& buffer, std::size_t prefix_size, std::size_t done, bool in_step,
                 bool ended) {
     risaf::Search search(extras_, data(buffer), buffer.size(), prefix_size, ended);
+    std::optional<nb::gil_scoped_release> others_may_run;
+    if (buffer.size() >= LONG) {
+      others_may_run.emplace();
+    }
     const auto [rest, follows] = search.cut(done, in_step);
+    others_may_run.reset();
     summed += search.summed;
     const auto& dropped = search.dropped;
     return nb::make_tuple(
@@ -42,6 +48,8 @@ class Cutter {
   }
 
  private:
+  static constexpr std::size_t LONG = 1 << 16;  // bytes; with fewer others can wait
+
   risaf::Search::Extras extras_;
 };
 
