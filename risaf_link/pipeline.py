@@ -23,7 +23,7 @@ from risaf_link.core.fusion import Epoch, EpochBlock, FusionParameters
 from risaf_link.core.heading import GpsFix, HeadingFinder, HeadingMonitor, HeadingParameters
 from risaf_link.core.memory import ArrayIdentity, Memory
 from risaf_link.core.rotation import Floats
-from risaf_link.core.track import WALK, Track
+from risaf_link.core.track import ALIGNED, WALK, Track
 from risaf_link.core.warm import WarmStart
 from risaf_link.mavlink.clock import VehicleClock
 from risaf_link.mavlink.dialect import IDS
@@ -215,7 +215,7 @@ class Pipeline:
             self._clock.delay_us,
             elapsed,
             track,
-            self._monitor.advance(elapsed, track.aligned),
+            self._monitor.advance(elapsed, track.values[:, ALIGNED]),
             partial(self._array_status, epochs.rates_b.shape[1]),
         )
         return self._latest

@@ -203,17 +203,18 @@ class Service:
         self._frames_in[sender[0]] += len(table)
         self._record(table, received_us)
         self._component.note_traffic(table, sender)
-        for item in self._blocks.read(table, np.full(len(table), received_us, np.uint64)):
+        are_answers_due = False
+        for item in self._blocks.read(table, np.array([received_us] * len(table), np.uint64)):
             if isinstance(item, EpochBlock):
                 self._send(self.pipeline.advance(item))
             else:
                 frame, _ = item
+                are_answers_due = True
                 self._component.receive(frame, sender, received_us)
                 self._send(self.pipeline.gather(frame, received_us))
                 self._send(self.pipeline.release())
-        self._hand_out(self._component.collect(chain(self._peers(), (sender,))))
-        self._tell_mismatch()
-        self._tell_recalled()
+        if are_answers_due:
+            self._hand_out(self._component.collect(chain(self._peers(), (sender,))))
         if self.pipeline.ingest.heard_us != before_us:
             return Worth.SAMPLES
         return self._gate.worth(table, sender[0])
@@ -340,6 +341,8 @@ class Service:
             self._look_after_keys(loop.time())
             self._look_after_state(loop.time())
             self._tell_gibberish(loop.time())
+            self._tell_mismatch()
+            self._tell_recalled()
             now_us = round(loop.time() * 1e6)
             gathered = self.pipeline.assembler.counts["epochs"]
             is_alive = self._component.note_gathered(gathered, now_us)

@@ -183,7 +183,8 @@ def state(of):
         return of.came.tolist(), of.count
     if type(of).__name__ == "Roster":
         gone = {time_us: of.recall(time_us) for time_us in list(of.gone)}
-        return state({**vars(of), "gone": gone})
+        rest = {name: value for name, value in vars(of).items() if name != "_whole"}
+        return state({**rest, "gone": gone, "_attended": of.attended})
     if is_dataclass(of):
         return [state(getattr(of, field.name)) for field in fields(of)]
     if isinstance(of, (Ingest, EpochAssembler)) or type(of).__name__ in REMEMBERING:

@@ -35,14 +35,16 @@ class Estimate:
     ----------
     time_us : int
         As the samples were stamped.
-    elapsed : float
-        Seconds since the first epoch, whatever the clocks did.
     """
 
     def __init__(self, block: "EstimateBlock", i: int) -> None:
         self._block, self._i = block, i
         self.time_us = int(block.time_us[i])
-        self.elapsed = float(block.elapsed[i])
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the first epoch, whatever the clocks did."""
+        return float(self._block.elapsed[self._i])
 
     @cached_property
     def boot_us(self) -> int:

@@ -333,7 +333,7 @@ class HeadingTrack(Struct, frozen=True):
     lost_s: float  # from when on there is no fix
     with_fix: States  # until then
     elapsed: Floats  # (k,) s
-    aligned: NDArray[np.bool_]  # (k,)
+    aligned: Floats  # (k,) 1: yaw is known; 0: it is not
 
     @property
     def state(self) -> NDArray[np.int64]:
@@ -383,8 +383,8 @@ class HeadingMonitor:
         """Take new parameters; what was learnt stays."""
         self._parameters = parameters
 
-    def advance(self, elapsed: Floats, aligned: NDArray[np.bool_]) -> HeadingTrack:
-        """Let k epochs pass, with yaw known or not; nothing is noted in between.
+    def advance(self, elapsed: Floats, aligned: Floats) -> HeadingTrack:
+        """Let k epochs pass, with yaw known, 1, or not, 0; nothing is noted in between.
 
         Parameters
         ----------

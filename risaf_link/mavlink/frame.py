@@ -3,8 +3,10 @@
 How a stream is cut into frames is said in `search`. The kernel does the same where it was built.
 """
 
+import struct
 from collections import Counter
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,8 @@ from risaf_link.mavlink.search import (
     SIGNED,
 )
 
+_HEADER = struct.Struct("<BBBBBBBHB")
+
 cut = native.Cutter(CRC_EXTRA).cut if native else search.cut
 
 
@@ -43,7 +47,7 @@ class Frame(Struct, frozen=True):  # a frozen dataclass takes as long to make as
     prefix: bytes = b""  # what stood before the frame, where the stream has prefixes
 
 
-class FrameTable(Struct, frozen=True):
+class FrameTable(Struct, frozen=True, dict=True):
     """Frames of one piece of a stream, without an object for each."""
 
     buffer: bytes
@@ -57,7 +61,7 @@ class FrameTable(Struct, frozen=True):
         """The records as an array, of type CUTS."""
         return np.frombuffer(self.records, CUTS)
 
-    @property
+    @cached_property
     def origins(self) -> list[tuple[int, int, int]]:
         """Message, system and component of each; of a few frames, quicker than the columns."""
         return [
@@ -201,7 +205,8 @@ def encode(
         From the frame to its signature, 13 bytes; None: it is not signed.
     """
     payload = payload[:1] + payload[1:].rstrip(b"\0")
-    header = bytes((len(payload), SIGNED if sign else 0, 0, sequence, system, component))
-    content = header + message_id.to_bytes(3, "little") + payload
-    frame = bytes((MARK_V2,)) + content + search.checksum_of(content, CRC_EXTRA[message_id])
+    flags, low, high = SIGNED if sign else 0, message_id & 0xFFFF, message_id >> 16
+    header = _HEADER.pack(MARK_V2, len(payload), flags, 0, sequence, system, component, low, high)
+    frame = header + payload
+    frame += search.checksum_of(frame[1:], CRC_EXTRA[message_id])
     return frame + sign(frame) if sign else frame

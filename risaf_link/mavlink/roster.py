@@ -67,8 +67,8 @@ class Roster:
         How many there are, as the array says; 0: it has not said.
     awaited : ndarray of bool, shape (n,)
         Who came, of late, more than half as often as the most regular one of the array.
-    attended : ndarray of int, shape (n,)
-        With how many epochs each came since the last review.
+    size : int
+        How many sensors there are.
     expected : int
         How many belong to a complete epoch: who is awaited, and all that are told of.
     open, gone : dict of int to Instant
@@ -79,15 +79,16 @@ class Roster:
     def __init__(self, told: int = 0) -> None:
         self.open: dict[int, Instant] = {}
         self.gone: dict[int, Instant | int] = {}
-        self.attended = np.zeros(told, dtype=np.int64)
         self.told = told
+        self._attended = np.zeros(told, dtype=np.int64)  # with epochs that were not whole
+        self._whole = 0  # epochs
         self._seen = 0  # the last sensor that came of late, plus one
         self._await(np.ones(told, dtype=bool))
 
     @property
-    def size(self) -> int:
-        """How many sensors there are."""
-        return len(self.awaited)
+    def attended(self) -> NDArray[np.int64]:
+        """With how many epochs each came since the last review, (n,)."""
+        return self._attended + self._whole
 
     @property
     def awaits_all(self) -> bool:
@@ -124,7 +125,7 @@ class Roster:
         if not self.size:
             return
         self._seen = max(self._seen, self.size)
-        self.attended += len(times_us)
+        self._whole += len(times_us)
         self.gone.update(dict.fromkeys(times_us, self.size))
         self._forget_old()
 
@@ -157,7 +158,7 @@ class Roster:
 
     def attend(self, first: int, came: Mask) -> None:
         """Take note of who came with an epoch."""
-        attended = self.attended[first : first + len(came)]
+        attended = self._attended[first : first + len(came)]
         attended += came[: len(attended)]
 
     def review(self, most: int) -> None:
@@ -169,7 +170,7 @@ class Roster:
             With how many epochs the most regular sensor of the array has come.
         """
         self._await(2 * self.attended > most)
-        self.attended[:] = 0
+        self._attended[:] = self._whole = 0
 
     def forget_silent(self) -> None:
         """Forget the last sensors if they have not come since this was last done."""
@@ -178,11 +179,11 @@ class Roster:
 
     def _resize(self, size: int) -> None:
         """Take newcomers to be as regular as the best."""
-        self.attended = fitted(self.attended, size, self.attended.max(initial=0))
+        self._attended = fitted(self._attended, size, self._attended.max(initial=0))
         self._await(fitted(self.awaited, size, True))
 
     def _await(self, awaited: Mask) -> None:
-        self.awaited, self._expected = awaited, awaited.copy()
+        self.awaited, self._expected, self.size = awaited, awaited.copy(), len(awaited)
         self._expected[: self.told] = True
         self._quorum = int(np.count_nonzero(awaited))
         self.expected = int(np.count_nonzero(self._expected))

@@ -193,11 +193,17 @@ def heartbeat(state: ComponentState) -> dict[str, Any]:
 
 
 def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
-    q_nb, rate_b = estimate.attitude.q_nb, estimate.attitude.rate_b
+    w, x, y, z = estimate.attitude.q_nb.tolist()
+    roll, pitch, yaw = estimate.attitude.rate_b.tolist()
     return {
         "time_boot_ms": estimate.boot_us // 1000 % 2**32,
-        **dict(zip(("q1", "q2", "q3", "q4"), q_nb.tolist(), strict=True)),
-        **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rate_b.tolist(), strict=True)),
+        "q1": w,
+        "q2": x,
+        "q3": y,
+        "q4": z,
+        "rollspeed": roll,
+        "pitchspeed": pitch,
+        "yawspeed": yaw,
         "repr_offset_q": (0.0, 0.0, 0.0, 0.0),
     }
 
