@@ -53,12 +53,11 @@ class Gate:
         signing = self._signings.get(sender[0])
         if signing is not None:
             table = signing.taken(table)
-        ids = [message_id for message_id, *_ in table.origins]
-        if _TARGETS.keys().isdisjoint(ids):
+        if table.message_ids.isdisjoint(_TARGETS):
             return table
         taken = [
             message_id not in _TARGETS or self._obeys(table.frame(row), sender, received_us / 1e6)
-            for row, message_id in enumerate(ids)
+            for row, (message_id, *_) in enumerate(table.origins)
         ]
         return table.part(np.array(taken, bool))
 

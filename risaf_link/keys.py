@@ -143,8 +143,10 @@ class Keys:
 
     def tell_rejected(self, now_s: float) -> None:
         """Say in the log what was rejected, if there is more, but not all the time."""
+        if now_s < self._next_telling_s or not self.links:
+            return
         rejected = self.rejected
-        if now_s < self._next_telling_s or rejected == self._told_rejected:
+        if rejected == self._told_rejected:
             return
         self._next_telling_s = now_s + TELL_REJECTED_S
         new = sorted((rejected - self._told_rejected).items())

@@ -4,9 +4,8 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine
 from functools import partial
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -201,7 +200,8 @@ class Service:
             return Worth.NOTHING
         self._frames += len(table)
         self._frames_in[sender[0]] += len(table)
-        self._record(table, received_us)
+        if self._recordings:
+            self._record(table, received_us)
         self._component.note_traffic(table, sender)
         are_answers_due = False
         for item in self._blocks.read(table, np.array([received_us] * len(table), np.uint64)):
@@ -214,29 +214,28 @@ class Service:
                 self._send(self.pipeline.gather(frame, received_us))
                 self._send(self.pipeline.release())
         if are_answers_due:
-            self._hand_out(self._component.collect(chain(self._peers(), (sender,))))
+            self._hand_out(self._component.collect([*self._peers(), sender]))
         if self.pipeline.ingest.heard_us != before_us:
             return Worth.SAMPLES
         return self._gate.worth(table, sender[0])
 
     def _record(self, table: FrameTable, received_us: int) -> None:
         """Record what was taken, but for keys."""
-        if not self._recordings:
-            return
         frames = table.raw(but=SETUP_SIGNING)
         for recording in self._recordings:
             recording.record(received_us, *frames)
 
     def _send(self, blocks: list[EstimateBlock]) -> None:
         for block in blocks:
-            peers = list(self._peers())
-            for estimate, received_us in zip(block, block.received_us.tolist(), strict=True):
+            peers = self._peers()
+            for i, received_us in enumerate(block.received_us.tolist()):
+                estimate = block.at(i)
                 self._component.observe(estimate)
                 self._hand_out(self._component.emit(estimate, peers))
                 self._outputs.take(estimate, received_us, self._began_ns)
 
-    def _peers(self) -> Iterator[Peer]:
-        return ((link.name, peer) for link in self.links for peer in link.peers)
+    def _peers(self) -> list[Peer]:
+        return [(link.name, peer) for link in self.links for peer in link.peers]
 
     def _hand_out(self, frames: list[tuple[Peer, bytes]]) -> None:
         for (link, peer), raw in frames:

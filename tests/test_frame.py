@@ -246,7 +246,7 @@ def test_frames_and_counts_are_the_same_whatever_the_chunks(parts, prefix_size, 
 
 @settings(max_examples=50)
 @given(pieces(), st.sampled_from([0, 8]), st.lists(st.integers(0, 2000), max_size=12))
-def test_the_parser_never_holds_more_than_two_frames_and_what_is_around_them(parts, prefix_size, sizes):
+def test_the_parser_never_holds_more_than_two_frames(parts, prefix_size, sizes):
     for cut in (sizes, [1] * 2000):
         parser = FrameParser(prefix_size)
         for chunk in chunks(b"".join(parts), cut):

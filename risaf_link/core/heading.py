@@ -378,6 +378,7 @@ class HeadingMonitor:
         self._fused_s = math.nan
         self._fused_count = 0
         self._rejected_count = 0
+        self._with_fix = self._states()
 
     def configure(self, parameters: HeadingParameters) -> None:
         """Take new parameters; what was learnt stays."""
@@ -401,7 +402,7 @@ class HeadingMonitor:
             self._rejected_count,
             self._fused_s,
             self._fix_s + self._parameters.timeout,
-            self._with_fix(),
+            self._with_fix,
             elapsed,
             aligned,
         )
@@ -410,6 +411,7 @@ class HeadingMonitor:
         """Take note of a usable fix."""
         self._fix_s = self._elapsed
         self._motion = motion
+        self._with_fix = self._states()
 
     def note_innovation(self, heading: Heading, innovation: Innovation) -> None:
         """Take note of what the filter made of a heading."""
@@ -419,8 +421,10 @@ class HeadingMonitor:
             self._fused_s = self._elapsed
         else:
             self._rejected_count += 1
+        self._with_fix = self._states()
 
-    def _with_fix(self) -> States:
+    def _states(self) -> States:
+        """While there is a fix."""
         if self._motion.heading is None:
             return HeadingState.TOO_SLOW, HeadingState.TOO_SLOW
         if self._innovation is None or self._innovation.reset:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from risaf_link.core.attitude import AttitudeState
@@ -19,7 +20,7 @@ COLUMNS = 38
 YAW_STD = 12
 
 
-class Track:
+class Track(Struct, frozen=True):
     """Fused rates and attitudes of k epochs, one after another.
 
     Parameters
@@ -28,8 +29,7 @@ class Track:
         The columns that this module names; units are those of `FusedRate` and `AttitudeState`.
     """
 
-    def __init__(self, values: Floats) -> None:
-        self.values = values
+    values: Floats
 
     @classmethod
     def of(cls, epochs: Iterable[tuple[FusedRate, AttitudeState, Floats]]) -> "Track":

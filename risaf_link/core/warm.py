@@ -169,14 +169,15 @@ class WarmStart:
     def advance(self, epochs: EpochBlock) -> list[tuple[EpochBlock, Track, Floats]]:
         """Carry the estimate on, as `Estimator.advance` does; the trial ends between two parts."""
         trial = self._trial
-        share = trial.share(epochs.dt) if trial else len(epochs)
+        if trial is None:
+            return [(epochs, *self.estimator.advance(epochs.dt, epochs.rates_b, epochs.forces_b))]
+        share = trial.share(epochs.dt)
         part, rest = epochs, None
         if share < len(epochs):
             part, rest = epochs.part(slice(share)), epochs.part(slice(share, None))
-        if trial:
-            trial.note_epochs(part, self.estimator.elapsed)
+        trial.note_epochs(part, self.estimator.elapsed)
         track, elapsed = self.estimator.advance(part.dt, part.rates_b, part.forces_b)
-        if trial and trial.is_over:
+        if trial.is_over:
             self._judge(trial, int(track.values[-1, RESETS]))
         done = [(part, track, elapsed)]
         return done if rest is None else done + self.advance(rest)

@@ -161,10 +161,9 @@ class BlockReader:
         columns = self._columns(values, size)
         newest_us, begun_us, heard_us = came_us
         time_us = columns[0].item(-1)
-        newest, begun = (
-            GyroChunk(source, time_us, received_us, 0, NONE, NONE, sequence, info.sensors)
-            for received_us in (newest_us, begun_us)
-        )
+        of_epoch = 0, NONE, NONE, sequence, info.sensors
+        newest = GyroChunk(source, time_us, newest_us, *of_epoch)
+        begun = GyroChunk(source, time_us, begun_us, *of_epoch)
         block = RegularEpochs(*columns, newest, begun, last_row + 1, asides)
         self._ingest.take_block(heard_us, *unusable, map(table.frame, refused))
         self._assembler.take_block(block)

@@ -10,8 +10,10 @@ both clocks holds as it was.
 """
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from risaf_link.mavlink.dialect import IDS, reader
@@ -32,18 +34,18 @@ _SYSTEM_TIME = reader("SYSTEM_TIME", "time_unix_usec", "time_boot_ms")
 Times = NDArray[np.int64]
 
 
-class _Stamps:
+class _Stamps(Struct):
     """Boot times of some epochs, when they are asked for."""
 
-    def __init__(self, time_us: Times, received_us: Times, catch_up: Callable[[], None]) -> None:
-        self.time_us, self.received_us = time_us, received_us
-        self.boot_us = time_us[:0]  # not known yet
-        self._catch_up = catch_up
+    time_us: Times
+    received_us: Times
+    catch_up: Callable[[], None]
+    boot_us: Times | None = None  # not known yet
 
     def __call__(self) -> Times:
-        if not len(self.boot_us):
-            self._catch_up()
-        return self.boot_us
+        if self.boot_us is None:
+            self.catch_up()
+        return cast("Times", self.boot_us)
 
 
 class VehicleClock:
@@ -157,8 +159,7 @@ class VehicleClock:
     def boot_times(self, time_us: Times, received_us: Times) -> Times:
         """Do what `boot_us` does, for k epochs that were received one after another."""
         if len(time_us) < MANY:
-            epochs = zip(time_us.tolist(), received_us.tolist(), strict=True)
-            return np.array([self.boot_us(*epoch) for epoch in epochs])
+            return np.array(list(map(self.boot_us, time_us.tolist(), received_us.tolist())))
         stamps = np.empty(len(time_us), np.int64)
         done = 0
         while done < len(stamps):

@@ -179,7 +179,8 @@ class Component:
         self._estimate = estimate
         self._pulse.note_epoch()
         self._notices.observe(estimate)
-        self._report(self._calibration.observe(estimate))
+        if self.is_calibrating:
+            self._report(self._calibration.observe(estimate))
 
     def note_gathered(self, epochs: int, now_us: int) -> bool:
         """Take note of how many epochs have come by now, as `advance` takes the time.

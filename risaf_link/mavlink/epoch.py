@@ -107,18 +107,22 @@ class EpochAssembler:
         `clock_resets` (back), `clock_jumps` (ahead); of samples, that is readings of one sensor:
         `samples_lost` (of gyros, that never came), `late`, `duplicate`, `astray` (far off),
         `unclaimed` (of accelerometers, no epoch came for them), `out_of_range`.
+    source : Source or None
+        Where the samples come from.
+    last : GyroChunk or None
+        What began the last epoch, by the present clock.
     """
 
     def __init__(self, parameters: ArrayParameters) -> None:
         self.counts: Counter[str] = Counter()
         self._parameters = parameters
         self._max_wait_us = round(parameters.max_wait * 1e6)
-        self._source: Source | None = None
+        self.source: Source | None = None
         self._gyros, self._accels = Roster(parameters.sensors), Roster()
         self._begun_by: dict[int, GyroChunk] = {}  # every epoch that waits
         self._newest: GyroChunk | None = None
         self._astray: list[GyroChunk] = []
-        self._last: GyroChunk | None = None  # began the last epoch, by the present clock
+        self.last: GyroChunk | None = None
         self._last_received_us: int | None = None  # likewise, by any clock
         self._last_size = 0
         self._steps_us: deque[int] = deque(maxlen=STEPS)
@@ -128,17 +132,12 @@ class EpochAssembler:
         """How many gyros the array has, as far as is known."""
         return self._gyros.size
 
-    @property
-    def source(self) -> Source | None:
-        """Where the samples come from."""
-        return self._source
-
     def add(self, chunk: GyroChunk) -> list[Epoch]:
         """Take one chunk; hand on what is ready now, in order."""
         if chunk.end > MAX_SENSORS:
             self.counts["out_of_range"] += chunk.samples
             return []
-        if chunk.source != self._source:
+        if chunk.source != self.source:
             return self._change_source(chunk) + self._take(chunk)
         ahead_us, passed_us = self._since_newest(chunk)
         is_near = -JUMP_US <= ahead_us <= passed_us + JUMP_US
@@ -170,7 +169,7 @@ class EpochAssembler:
         told : int
             How many gyros the array says it has; 0: it does not say.
         """
-        last, newest = self._last, self._newest
+        last, newest = self.last, self._newest
         return (
             last is not None
             and newest is not None
@@ -182,11 +181,6 @@ class EpochAssembler:
             and self._gyros.awaits_all
             and self._accels.awaits_all
         )
-
-    @property
-    def last(self) -> GyroChunk | None:
-        """What began the last epoch, by the present clock."""
-        return self._last
 
     @property
     def forces(self) -> int:
@@ -204,13 +198,13 @@ class EpochAssembler:
         The chunks of an epoch came together, those of either kind in the order of the sensors. The
         time goes on from `last` by no more than SET_US an epoch, and the sequence number by one.
         """
-        if self._last is None or len(block) > self.until_review:
-            raise ValueError("block: must follow on an epoch and end with the next review")
         times_us = block.time_us.tolist()
+        if self.last is None or len(times_us) > self.until_review:
+            raise ValueError("block: must follow on an epoch and end with the next review")
         for roster in (self._gyros, self._accels):
             roster.close_whole(times_us)
-        self.counts["epochs"] += len(block)
-        recent_us = [self._last.time_us, *times_us][-STEPS - 1 :]
+        self.counts["epochs"] += len(times_us)
+        recent_us = [self.last.time_us, *times_us][-STEPS - 1 :]
         self._steps_us.extend(map(sub, recent_us[1:], recent_us))
         self._newest = block.newest
         self._close_steps(block.begun)
@@ -219,10 +213,10 @@ class EpochAssembler:
 
     def _change_source(self, chunk: GyroChunk) -> list[Epoch]:
         """Begin anew with an array of which nothing is known."""
-        if self._source is not None:
+        if self.source is not None:
             self.counts["source_changes"] += 1
         epochs = self._begin_clock(chunk)
-        self._source = chunk.source
+        self.source = chunk.source
         self._gyros, self._accels = Roster(self._parameters.sensors), Roster()
         self._steps_us.clear()
         self._last_size = 0
@@ -260,7 +254,7 @@ class EpochAssembler:
         epochs = self.flush()
         self._gyros.gone.clear()
         self._accels.gone.clear()
-        self._newest, self._last = chunk, None
+        self._newest, self.last = chunk, None
         return epochs
 
     def _drop_astray(self) -> None:
@@ -300,7 +294,7 @@ class EpochAssembler:
             self._gyros.attend(first, came)
             new = int(np.count_nonzero(came))
             self.counts["late"] += new
-        elif self._last is not None and time_us <= self._last.time_us:
+        elif self.last is not None and time_us <= self.last.time_us:
             new = count
             self.counts["late"] += new
         else:
@@ -388,22 +382,22 @@ class EpochAssembler:
 
     def _step(self, begun: GyroChunk) -> float:
         """Seconds since the epoch before: by the array's clock, by arrival if that has jumped."""
-        if self._last is not None:
-            return (begun.time_us - self._last.time_us) / 1e6
+        if self.last is not None:
+            return (begun.time_us - self.last.time_us) / 1e6
         if self._last_received_us is None:
             return 0.0
         return max(self._period_us(), begun.received_us - self._last_received_us) / 1e6
 
     def _epochs_before(self, begun: GyroChunk) -> int:
         """How many epochs are missing between the last one and this."""
-        if self._last is None:
+        if self.last is None:
             return 0
-        step_us = begun.time_us - self._last.time_us
+        step_us = begun.time_us - self.last.time_us
         period_us = self._period_us()
         by_time = max(0, round(step_us / period_us) - 1) if period_us else 0
-        if begun.sequence is None or self._last.sequence is None:
+        if begun.sequence is None or self.last.sequence is None:
             return by_time
-        by_number = (begun.sequence - self._last.sequence - 1) % 65536
+        by_number = (begun.sequence - self.last.sequence - 1) % 65536
         return by_number if by_number <= MAX_OPEN else min(by_number, by_time)
 
     def _period_us(self) -> int:
@@ -412,12 +406,12 @@ class EpochAssembler:
         return steps_us[len(steps_us) // 2] if steps_us else 0
 
     def _end_epoch(self, begun: GyroChunk) -> None:
-        if self._last is not None:
-            self._steps_us.append(begun.time_us - self._last.time_us)
+        if self.last is not None:
+            self._steps_us.append(begun.time_us - self.last.time_us)
         self._close_steps(begun)
 
     def _close_steps(self, begun: GyroChunk) -> None:
-        self._last, self._last_received_us = begun, begun.received_us
+        self.last, self._last_received_us = begun, begun.received_us
         if self.counts["epochs"] % REVIEW == 0:
             most = self._gyros.attended.max()
             for roster in (self._gyros, self._accels):

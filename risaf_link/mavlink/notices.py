@@ -10,6 +10,7 @@ from risaf_link.core.estimate import Estimate
 from risaf_link.core.heading import HeadingState
 from risaf_link.core.health import SensorState
 
+LOOK_US = 500_000  # from one look at the estimate to the next: to judge all sensors takes long
 LEAST_PAUSE_US = 5_000_000  # between two notices of one matter
 REJECTED_FOR = 2.0  # s without a heading that was fused, until rejection is a state
 CHUNK = 50  # characters
@@ -45,6 +46,7 @@ class Notices:
         self._estimate: Estimate | None = None
         self._clock_resets = 0
         self._rejecting = False
+        self._next_look_us = 0  # at the estimate
 
     def observe(self, estimate: Estimate) -> None:
         """Take the next estimate."""
@@ -71,7 +73,8 @@ class Notices:
         silent = has_stalled and not trouble
         notices = [self._of_samples(now_us, silent), self._of_trouble(now_us, trouble)]
         notices += [self._of_complaint(now_us, *each) for each in complaints.items()]
-        if self._estimate:
+        if self._estimate and now_us >= self._next_look_us:
+            self._next_look_us = now_us + LOOK_US
             notices += self._of_estimate(self._estimate, now_us)
         return [notice for notice in notices if notice]
 

@@ -191,13 +191,12 @@ class Requests:
 
     def note_traffic(self, table: FrameTable, peer: Peer) -> None:
         """Take note of all that a peer sent: what counts is what arrives."""
-        origins = table.origins
-        if "GYRO_ARRAY" in self._encodings and any(each[0] == GYRO_ARRAY for each in origins):
+        if "GYRO_ARRAY" in self._encodings and GYRO_ARRAY in table.message_ids:
             self._array_us = self._now_us
         if self._at is None or self._order[peer[0]] > self._order[self._at[0]]:
             return
         sender, needs = self._autopilots[self._at].sender, self._autopilots[self._at].needs
-        for message_id, *whose in origins:
+        for message_id, *whose in table.origins:
             for need in needs:
                 if need.message_id == message_id and tuple(whose) == sender:
                     need.counts[peer] += 1
