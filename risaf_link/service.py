@@ -180,7 +180,7 @@ class Service:
         if self._held.holds(data):
             return Worth.UNKNOWN
         worth = self._take(self._held.take(data), sender)
-        self._held.note_end(data, self._blocks.is_steady)
+        self._held.note_end(self._blocks.is_steady)
         return worth
 
     def _take_held(self) -> None:
@@ -196,15 +196,16 @@ class Service:
         cut = self._parser(*sender).receive_table(data)
         self._gibberish.note(sender[0], len(cut))
         table = self._gate.admitted(cut, sender, received_us)
-        if not len(table):  # garbage costs no more than that
+        count = len(table)
+        if not count:  # garbage costs no more than that
             return Worth.NOTHING
-        self._frames += len(table)
-        self._frames_in[sender[0]] += len(table)
+        self._frames += count
+        self._frames_in[sender[0]] += count
         if self._recordings:
             self._record(table, received_us)
         self._component.note_traffic(table, sender)
         are_answers_due = False
-        for item in self._blocks.read(table, np.array([received_us] * len(table), np.uint64)):
+        for item in self._blocks.read(table, np.array([received_us] * count, np.uint64)):
             if isinstance(item, EpochBlock):
                 self._send(self.pipeline.advance(item))
             else:

@@ -105,11 +105,16 @@ def test_what_waits_is_taken_before_what_another_sends():
     assert watched.service._frames >= frames + 1
 
 
+def end(held, data):
+    """Let an epoch end with a datagram."""
+    assert not held.holds(data)
+    held.note_end(steady=True)
+
+
 def test_no_more_is_held_than_that():
     first, second = (raw for raw in sent("circle", 20)[-1][-2:])
     held = Held()
-    assert not held.holds(first)
-    held.note_end(second, steady=True)
+    end(held, second)
     assert all(held.holds(first) for _ in range(MOST_HELD))
     assert not held.holds(first)
     assert held.take(second) == MOST_HELD * first + second
@@ -119,8 +124,8 @@ def test_no_more_is_held_than_that():
 def test_nothing_is_held_while_something_waits_in_the_pipeline():
     first, second = (raw for raw in sent("circle", 20)[-1][-2:])
     held = Held()
-    held.note_end(second, steady=True)
-    held.note_end(second, steady=False)
+    end(held, second)
+    held.note_end(steady=False)
     assert not held.holds(first)
 
 
@@ -128,6 +133,6 @@ def test_nothing_is_held_while_something_waits_in_the_pipeline():
 def test_a_piece_of_a_frame_is_not_held(cut):
     first, second = (raw for raw in sent("circle", 20)[-1][-2:])
     held = Held()
-    held.note_end(second, steady=True)
+    end(held, second)
     assert not held.holds(first[:cut])
     assert not held.holds(first + second[:cut] + b"\0")

@@ -46,7 +46,7 @@ class Estimate:
         """Seconds since the first epoch, whatever the clocks did."""
         return float(self._block.elapsed[self._i])
 
-    @cached_property
+    @property
     def boot_us(self) -> int:
         """The instant that it tells of, on the vehicle's boot clock."""
         return int(self._block.boot_us[self._i])

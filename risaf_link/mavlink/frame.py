@@ -6,7 +6,6 @@ How a stream is cut into frames is said in `search`. The kernel does the same wh
 import struct
 from collections import Counter
 from collections.abc import Callable
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -47,7 +46,7 @@ class Frame(Struct, frozen=True):  # a frozen dataclass takes as long to make as
     prefix: bytes = b""  # what stood before the frame, where the stream has prefixes
 
 
-class FrameTable(Struct, frozen=True, dict=True):
+class FrameTable(Struct, frozen=True):
     """Frames of one piece of a stream, without an object for each."""
 
     buffer: bytes
@@ -61,10 +60,10 @@ class FrameTable(Struct, frozen=True, dict=True):
         """The records as an array, of type CUTS."""
         return np.frombuffer(self.records, CUTS)
 
-    @cached_property
-    def message_ids(self) -> frozenset[int]:
+    @property
+    def message_ids(self) -> set[int]:
         """Which messages there are; of a few frames, quicker than the column."""
-        return frozenset(record[2] for record in CUT.iter_unpack(self.records))
+        return {record[2] for record in CUT.iter_unpack(self.records)}
 
     @property
     def origins(self) -> list[tuple[int, int, int]]:

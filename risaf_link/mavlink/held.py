@@ -23,17 +23,16 @@ class Held:
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
-        self._last = b""  # which readings came last in an epoch; empty: nothing is held
+        self._part = b""  # which readings the present datagram carries; empty: it is another
+        self._last = b""  # which came last in an epoch; empty: nothing is held
 
     def __bool__(self) -> bool:
         return bool(self._parts)
 
     def holds(self, data: bytes) -> bool:
         """Keep a datagram, if it can wait."""
-        if not self._last or len(self._parts) >= MOST_HELD:
-            return False
-        part = _part(data)
-        if not part or part == self._last:
+        part = self._part = _part(data)
+        if not (part and self._last) or part == self._last or len(self._parts) >= MOST_HELD:
             return False
         self._parts.append(data)
         return True
@@ -45,12 +44,9 @@ class Held:
         parts, self._parts = self._parts, []
         return b"".join((*parts, data))
 
-    def note_end(self, data: bytes, steady: bool) -> None:
-        """Take note of a datagram that was taken, and whether nothing waits since."""
-        if not steady:
-            self._last = b""
-        else:
-            self._last = _part(data) or self._last
+    def note_end(self, steady: bool) -> None:
+        """Take note that the present datagram was taken, and whether nothing waits since."""
+        self._last = (self._part or self._last) if steady else b""
 
 
 def _part(data: bytes) -> bytes:

@@ -193,8 +193,9 @@ def heartbeat(state: ComponentState) -> dict[str, Any]:
 
 
 def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
-    w, x, y, z = estimate.attitude.q_nb.tolist()
-    roll, pitch, yaw = estimate.attitude.rate_b.tolist()
+    attitude = estimate.attitude
+    w, x, y, z = attitude.q_nb.tolist()
+    roll, pitch, yaw = attitude.rate_b.tolist()
     return {
         "time_boot_ms": estimate.boot_us // 1000 % 2**32,
         "q1": w,
