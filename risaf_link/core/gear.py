@@ -6,6 +6,8 @@ turns round at speed is no change of gear. And what the accelerometer feels alon
 the change of speed, with the gear's sign.
 """
 
+import numpy as np
+
 from risaf_link.core.rotation import Floats
 
 STANDING_SPEED = 0.5  # m/s; GPS shows half of it where nothing moves
@@ -41,11 +43,11 @@ class Gear:
 
     def feel(self, ahead: Floats, dt: Floats) -> None:
         """Use what k epochs felt ahead, (k,) m/s^2; NaN: there is no accelerometer."""
-        for force, seconds in zip(ahead.tolist(), dt.tolist(), strict=True):
-            if -LARGEST_FORCE < force < LARGEST_FORCE:
-                self._felt += force * seconds
-            else:
-                self._begun = None
+        known = np.abs(ahead) < LARGEST_FORCE
+        if not known.all():
+            self._begun = None
+        for gained in (ahead * dt)[known].tolist():
+            self._felt += gained
 
     def hear(self, speed: float, speed_std: float, time_s: float) -> None:
         """Use a speed over ground, m/s, with its standard deviation."""

@@ -126,6 +126,18 @@ class Motion(Struct, frozen=True):
 UNKNOWN_TRACK = Motion(math.nan, None)
 
 
+class _Seen(Struct, frozen=True):
+    """A fix, and what its velocity and those before it add up to."""
+
+    time_s: float
+    fix: GpsFix
+    speed_north: float  # m/s
+    speed_east: float
+    north: float  # m
+    east: float
+    way: float
+
+
 class PositionWitness:
     """Holds a receiver's velocity against its own positions, over some seconds.
 
@@ -136,7 +148,7 @@ class PositionWitness:
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
-        self._seen: deque[tuple[float, GpsFix, float, float, float]] = deque()
+        self._seen: deque[_Seen] = deque()
         self._was_borne_out = False
 
     def contradicts(self, fix: GpsFix, time_s: float) -> bool:
@@ -144,31 +156,33 @@ class PositionWitness:
         if not all(map(math.isfinite, _content(fix))):
             self._seen.clear()
             return False
+        speed_north = fix.speed * math.cos(fix.course)
+        speed_east = fix.speed * math.sin(fix.course)
         north = east = way = 0.0
         if self._seen:
-            before_s, before, north, east, way = self._seen[-1]
-            timed = fix.time_us and before.time_us
-            elapsed = (fix.time_us - before.time_us) / 1e6 if timed else time_s - before_s
+            last = self._seen[-1]
+            timed = fix.time_us and last.fix.time_us
+            elapsed = (fix.time_us - last.fix.time_us) / 1e6 if timed else time_s - last.time_s
             if not 0 < elapsed <= self.timeout:
                 self._seen.clear()
-            for part in (before, fix):  # the trapezoidal rule
-                north += 0.5 * elapsed * part.speed * math.cos(part.course)
-                east += 0.5 * elapsed * part.speed * math.sin(part.course)
-                way += 0.5 * elapsed * part.speed
-            time_s = before_s + elapsed
-        self._seen.append((time_s, fix, north, east, way))
-        while self._seen[-1][0] - self._seen[0][0] > WITNESS_TIME:
+            half = 0.5 * elapsed  # the trapezoidal rule
+            north = last.north + half * (last.speed_north + speed_north)
+            east = last.east + half * (last.speed_east + speed_east)
+            way = last.way + half * (last.fix.speed + fix.speed)
+            time_s = last.time_s + elapsed
+        self._seen.append(_Seen(time_s, fix, speed_north, speed_east, north, east, way))
+        while time_s - self._seen[0].time_s > WITNESS_TIME:
             self._seen.popleft()
-        _, first, first_north, first_east, first_way = self._seen[0]
-        per_north, per_east = radii((fix.latitude + first.latitude) / 2)
+        first = self._seen[0]
+        per_north, per_east = radii((fix.latitude + first.fix.latitude) / 2)
         missed = math.hypot(
-            float(per_north) * (fix.latitude - first.latitude) - (north - first_north),
-            float(per_east) * wrap(fix.longitude - first.longitude) - (east - first_east),
+            float(per_north) * (fix.latitude - first.fix.latitude) - (north - first.north),
+            float(per_east) * wrap(fix.longitude - first.fix.longitude) - (east - first.east),
         )
         spread = math.sqrt(2.0) * _known(fix.position_std, UNKNOWN_POSITION_STD)
-        allowed = WITNESS_GATE * spread + WITNESS_SHARE * (way - first_way)
+        allowed = WITNESS_GATE * spread + WITNESS_SHARE * (way - first.way)
         if missed <= allowed:
-            self._was_borne_out |= way - first_way > 1.5 * allowed
+            self._was_borne_out |= way - first.way > 1.5 * allowed
             return False
         return self._was_borne_out
 
