@@ -23,7 +23,7 @@ class Held:
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
-        self._part = b""  # which readings the present datagram carries; empty: it is another
+        self._present = b""  # which readings the present datagram carries; empty: it is another
         self._last = b""  # which came last in an epoch; empty: nothing is held
 
     def __bool__(self) -> bool:
@@ -31,7 +31,7 @@ class Held:
 
     def holds(self, data: bytes) -> bool:
         """Keep a datagram, if it can wait."""
-        part = self._part = _part(data)
+        part = self._present = _part(data)
         if not (part and self._last) or part == self._last or len(self._parts) >= MOST_HELD:
             return False
         self._parts.append(data)
@@ -46,7 +46,7 @@ class Held:
 
     def note_end(self, steady: bool) -> None:
         """Take note that the present datagram was taken, and whether nothing waits since."""
-        self._last = (self._part or self._last) if steady else b""
+        self._last = (self._present or self._last) if steady else b""
 
 
 def _part(data: bytes) -> bytes:
