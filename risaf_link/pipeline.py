@@ -8,7 +8,7 @@ that a live run that is recorded and replayed gives the same estimates, bit for 
 """
 
 from functools import partial
-from itertools import groupby
+from itertools import groupby, starmap
 from zlib import crc32
 
 import msgspec
@@ -189,23 +189,23 @@ class Pipeline:
 
     def advance(self, epochs: EpochBlock) -> list[EstimateBlock]:
         """Carry the estimate on over epochs that ingest and assembler have handed on already."""
-        return [*self.release(), *self._advance(epochs)]
+        before = self.release() if self._waiting else []
+        return before + self._advance(epochs)
 
     def _wait(self, epochs: list[Epoch], received_us: int) -> None:
         self._waiting += [(epoch, received_us) for epoch in epochs]
 
     def _advance(self, epochs: EpochBlock) -> list[EstimateBlock]:
         """Carry the estimate on; none if the calibration is not of this array."""
-        if not self._fits(epochs.rates_b.shape[1]):
-            return []
-        rates_b, forces_b = epochs.rates_b, epochs.forces_b
         if self._calibration:
-            rates_b, forces_b = self._calibration.apply(rates_b, forces_b)
+            if not self._fits(self._calibration, epochs.rates_b.shape[1]):
+                return []
+            rates_b, forces_b = self._calibration.apply(epochs.rates_b, epochs.forces_b)
             epochs = structs.replace(epochs, rates_b=rates_b, forces_b=forces_b)
         delay = self.ingest.delay_of(self.assembler.source)
         if delay != self._delay:
             self._set_delay(delay)
-        return [self._told(*part) for part in self._start.advance(epochs)]
+        return list(starmap(self._told, self._start.advance(epochs)))
 
     def _told(self, epochs: EpochBlock, track: Track, elapsed: Floats) -> EstimateBlock:
         self._latest = EstimateBlock(
@@ -259,12 +259,11 @@ class Pipeline:
             self._start.estimator.fusion.health(),
         )
 
-    def _fits(self, sensors: int) -> bool:
-        if self._calibration is None:
-            return True
+    def _fits(self, calibration: Calibration, sensors: int) -> bool:
+        """Whether a calibration is that of the array."""
         source = self.assembler.source
         info = source and self.ingest.info(source)
-        self.mismatch = self._calibration.mismatch(
+        self.mismatch = calibration.mismatch(
             max(sensors, info.sensors if info else 0), info.name if info else ""
         )
         return not self.mismatch

@@ -41,12 +41,12 @@ class Estimate:
         self._block, self._i = block, i
         self.time_us = int(block.time_us[i])
 
-    @property
+    @cached_property
     def elapsed(self) -> float:
         """Seconds since the first epoch, whatever the clocks did."""
         return float(self._block.elapsed[self._i])
 
-    @property
+    @cached_property
     def boot_us(self) -> int:
         """The instant that it tells of, on the vehicle's boot clock."""
         return int(self._block.boot_us[self._i])

@@ -152,13 +152,13 @@ class BlockReader:
             return None
         if last is None or last.sequence is None:
             return None
-        source, info, *_ = self._laid_out
+        source, info, gyros, forces = self._laid_out
         heard_us = self._ingest.heard_us
         found = self._finder.take(self._layout, last.time_us, last.sequence, heard_us, most)
         if found is None:
             return None
         size, values, came_us, last_row, sequence, unusable, refused, asides = found
-        columns = self._columns(values, size)
+        columns = _columns(values, size, gyros, forces)
         newest_us, begun_us, heard_us = came_us
         time_us = columns[0].item(-1)
         of_epoch = 0, NONE, NONE, sequence, info.sensors
@@ -168,19 +168,6 @@ class BlockReader:
         self._ingest.take_block(heard_us, *unusable, map(table.frame, refused))
         self._assembler.take_block(block)
         return block
-
-    def _columns(self, values: bytes, k: int) -> Columns:
-        """Columns of k epochs out of what the kernel made of them."""
-        gyros, forces = self._assembler.sensors, self._assembler.forces
-        times_us, numbers = np.frombuffer(values, np.int64, 2 * k), np.frombuffer(values)[2 * k :]
-        rates_end = k + 3 * k * gyros
-        return (
-            times_us[:k],
-            numbers[:k],
-            numbers[k:rates_end].reshape(k, gyros, 3),
-            numbers[rates_end:].reshape(k, forces, 3),
-            times_us[k:],
-        )
 
     def _lay_out(self, source: Source, info: ArrayInfo) -> None:
         wanted = (source, info, self._assembler.sensors, self._assembler.forces)
@@ -195,6 +182,19 @@ class BlockReader:
                 native.Sensors(forces, *info.count_of(is_gyro=False)),
                 info.told,
             )
+
+
+def _columns(values: bytes, k: int, gyros: int, forces: int) -> Columns:
+    """Columns of k epochs out of what the kernel made of them."""
+    times_us, numbers = np.frombuffer(values, np.int64, 2 * k), np.frombuffer(values)[2 * k :]
+    rates_end = k + 3 * k * gyros
+    return (
+        times_us[:k],
+        numbers[:k],
+        numbers[k:rates_end].reshape(k, gyros, 3),
+        numbers[rates_end:].reshape(k, forces, 3),
+        times_us[k:],
+    )
 
 
 def _is_idle(aside: Frame) -> bool:

@@ -179,7 +179,7 @@ class Component:
         self._estimate = estimate
         self._pulse.note_epoch()
         self._notices.observe(estimate)
-        if self.is_calibrating:
+        if self._calibration.is_running:
             self._report(self._calibration.observe(estimate))
 
     def note_gathered(self, epochs: int, now_us: int) -> bool:

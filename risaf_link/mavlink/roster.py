@@ -117,7 +117,8 @@ class Roster:
     def close(self, time_us: int) -> Instant:
         """Hand on what was read at a time."""
         instant = self.gone[time_us] = self.open.pop(time_us)
-        self._forget_old()
+        if len(self.gone) >= 2 * REMEMBERED:
+            self._forget_old()
         return instant
 
     def close_whole(self, times_us: list[int]) -> None:
@@ -127,13 +128,13 @@ class Roster:
         self._seen = max(self._seen, self.size)
         self._whole += len(times_us)
         self.gone.update(dict.fromkeys(times_us, self.size))
-        self._forget_old()
+        if len(self.gone) >= 2 * REMEMBERED:
+            self._forget_old()
 
     def _forget_old(self) -> None:
-        """Keep half of the instants handed on whenever there are twice as many as needed."""
-        if len(self.gone) >= 2 * REMEMBERED:
-            keep = REMEMBERED + len(self.gone) % REMEMBERED
-            self.gone = dict(list(self.gone.items())[-keep:])
+        """Keep half of the instants handed on."""
+        keep = REMEMBERED + len(self.gone) % REMEMBERED
+        self.gone = dict(list(self.gone.items())[-keep:])
 
     def recall(self, time_us: int) -> Instant | None:
         """What was handed on of late that had been read at a time."""
