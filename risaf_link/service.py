@@ -3,12 +3,11 @@
 import asyncio
 import logging
 import time
+from array import array
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from functools import partial
 from typing import Any
-
-import numpy as np
 
 from risaf_link.config import Config, identity_of, load_calibration
 from risaf_link.core.estimate import EstimateBlock
@@ -205,7 +204,7 @@ class Service:
             self._record(table, received_us)
         self._component.note_traffic(table, sender)
         are_answers_due = False
-        for item in self._blocks.read(table, np.array([received_us] * count, np.uint64)):
+        for item in self._blocks.read(table, array("Q", [received_us]) * count):
             if isinstance(item, EpochBlock):
                 self._send(self.pipeline.advance(item))
             else:

@@ -1,3 +1,4 @@
+import array
 from typing import Any
 
 import numpy as np
@@ -144,7 +145,8 @@ def advance(
     dt: Floats,
     rates_b: Floats,
     forces_b: Floats,
-) -> Floats: ...
+    known: Floats,
+) -> None: ...
 
 class Cutter:
     summed: int
@@ -169,7 +171,9 @@ class ArrayLayout:
 
 class EpochFinder:
     def __init__(self, kinds: list[int], info_id: int, jump_us: int, patience_us: int) -> None: ...
-    def load(self, buffer: bytes, records: bytes, times_us: NDArray[np.uint64]) -> None: ...
+    def load(
+        self, buffer: bytes, records: bytes, times_us: NDArray[np.uint64] | array.array[int]
+    ) -> None: ...
     def take(
         self, array: ArrayLayout, time_us: int, sequence: int, heard_us: int, most: int
     ) -> (

@@ -20,6 +20,7 @@ from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.health import SILENT_AFTER, ArrayHealth, judge_silence
 from risaf_link.core.memory import ArrayMemory, FilterMemory
 from risaf_link.core.rotation import Floats
+from risaf_link.core.track import COLUMNS
 
 BUILT = native is not None
 """Whether there is a kernel."""
@@ -304,8 +305,10 @@ def advance(
         and isinstance(aid, _Aiding)
     ):
         return None
-    filters = attitude.kernel, aid.kernel
-    return native.advance(gyros.kernel, accelerometers.kernel, *filters, dt, rates_b, forces_b)
+    known: Floats = np.empty((len(dt), COLUMNS))
+    parts = gyros.kernel, accelerometers.kernel, attitude.kernel, aid.kernel
+    native.advance(*parts, dt, rates_b, forces_b, known)
+    return known
 
 
 def _told_risaf(p: FusionParameters) -> tuple[float, ...]:

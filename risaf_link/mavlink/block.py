@@ -13,6 +13,7 @@ last one, a HEARTBEAT of what is no autopilot) parts no block: it is handed on w
 The kernel finds the epochs. Where it was not built, every frame is handed on alone.
 """
 
+from array import array
 from collections.abc import Collection, Iterator
 from enum import IntEnum
 
@@ -86,13 +87,15 @@ class BlockReader:
                 list(self._kinds), IDS["IMU_ARRAY_INFO"], SET_US, PATIENCE_US
             )
 
-    def read(self, table: FrameTable, times_us: Stamps) -> Iterator[EpochBlock | tuple[Frame, int]]:
+    def read(
+        self, table: FrameTable, times_us: "Stamps | array[int]"
+    ) -> Iterator[EpochBlock | tuple[Frame, int]]:
         """Read the next frames of a log.
 
         Parameters
         ----------
         table : FrameTable
-        times_us : ndarray of uint64
+        times_us : ndarray or array of uint64
             When each frame was received.
 
         Yields

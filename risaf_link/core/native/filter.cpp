@@ -126,22 +126,28 @@ void recall(Eskf& filter, const Floats<nb::shape<4>>& q_nb, const Three& rate_b,
   filter.recall(vector(rate_b), errors.data(), latitude, aligned, levelled, resets);
 }
 
+constexpr std::size_t COLUMNS = sizeof(risaf::Known) / sizeof(double);
+using Known = nb::ndarray<double, nb::shape<-1, COLUMNS>, nb::c_contig, nb::device::cpu>;
+
+// The caller's array takes what becomes known: one made here would take longer than an epoch does.
 template <typename Fusion>
-Array<double> advance(Fusion& gyros, risaf::Robust& accelerometers, Eskf& filter, Aiding& aiding,
-                      const Floats<nb::shape<-1>>& dt, const Floats<nb::shape<-1, -1, 3>>& rates_b,
-                      const Floats<nb::shape<-1, -1, 3>>& forces_b) {
-  constexpr std::size_t COLUMNS = sizeof(risaf::Known) / sizeof(double);
+void advance(Fusion& gyros, risaf::Robust& accelerometers, Eskf& filter, Aiding& aiding,
+             const Floats<nb::shape<-1>>& dt, const Floats<nb::shape<-1, -1, 3>>& rates_b,
+             const Floats<nb::shape<-1, -1, 3>>& forces_b, const Known& known) {
   const std::size_t epochs = dt.shape(0);
-  if (rates_b.shape(0) != epochs || forces_b.shape(0) != epochs) {
-    throw nb::value_error("dt, rates_b, forces_b: found different lengths, expected one");
+  if (rates_b.shape(0) != epochs || forces_b.shape(0) != epochs || known.shape(0) != epochs) {
+    throw nb::value_error("dt, rates_b, forces_b, known: found different lengths, expected one");
   }
-  auto* values = new double[COLUMNS * epochs];
   const nb::gil_scoped_release others_may_run;
   risaf::advance(gyros, accelerometers, filter, aiding, epochs, dt.data(), rates_b.data(),
                  rates_b.shape(1), forces_b.data(), forces_b.shape(1),
-                 reinterpret_cast<risaf::Known*>(values));
-  const nb::gil_scoped_acquire back;
-  return owned(values, {epochs, COLUMNS});
+                 reinterpret_cast<risaf::Known*>(known.data()));
+}
+
+template <typename Fusion>
+void bind_advance(nb::module_& m) {
+  m.def("advance", &advance<Fusion>, "gyros"_a, "accelerometers"_a, "attitude"_a, "aiding"_a, "dt"_a,
+        "rates_b"_a, "forces_b"_a, "known"_a.noconvert());
 }
 
 }  // namespace
@@ -197,8 +203,8 @@ void bind_filter(nb::module_& m) {
         return told(aiding.take(filter, vector(rate_b), vector(force_b), dt));
       });
 
-  m.def("advance", &advance<risaf::Mean>);
-  m.def("advance", &advance<risaf::Median>);
-  m.def("advance", &advance<risaf::Robust>);
-  m.def("advance", &advance<risaf::Risaf>);
+  bind_advance<risaf::Mean>(m);
+  bind_advance<risaf::Median>(m);
+  bind_advance<risaf::Robust>(m);
+  bind_advance<risaf::Risaf>(m);
 }
