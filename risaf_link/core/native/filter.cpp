@@ -5,6 +5,8 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <optional>
+
 #include "aiding.hpp"
 #include "eskf.hpp"
 #include "estimator.hpp"
@@ -126,6 +128,7 @@ void recall(Eskf& filter, const Floats<nb::shape<4>>& q_nb, const Three& rate_b,
   filter.recall(vector(rate_b), errors.data(), latitude, aligned, levelled, resets);
 }
 
+constexpr std::size_t MANY = 8;  // epochs; for fewer others can wait
 constexpr std::size_t COLUMNS = sizeof(risaf::Known) / sizeof(double);
 using Known = nb::ndarray<double, nb::shape<-1, COLUMNS>, nb::c_contig, nb::device::cpu>;
 
@@ -138,7 +141,10 @@ void advance(Fusion& gyros, risaf::Robust& accelerometers, Eskf& filter, Aiding&
   if (rates_b.shape(0) != epochs || forces_b.shape(0) != epochs || known.shape(0) != epochs) {
     throw nb::value_error("dt, rates_b, forces_b, known: found different lengths, expected one");
   }
-  const nb::gil_scoped_release others_may_run;
+  std::optional<nb::gil_scoped_release> others_may_run;
+  if (epochs >= MANY) {
+    others_may_run.emplace();
+  }
   risaf::advance(gyros, accelerometers, filter, aiding, epochs, dt.data(), rates_b.data(),
                  rates_b.shape(1), forces_b.data(), forces_b.shape(1),
                  reinterpret_cast<risaf::Known*>(known.data()));
