@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import time
-from array import array
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from functools import partial
@@ -204,7 +203,7 @@ class Service:
             self._record(table, received_us)
         self._component.note_traffic(table, sender)
         are_answers_due = False
-        for item in self._blocks.read(table, array("Q", [received_us]) * count):
+        for item in self._blocks.read(table, received_us):
             if isinstance(item, EpochBlock):
                 self._send(self.pipeline.advance(item))
             else:

@@ -1,4 +1,3 @@
-import array
 from typing import Any
 
 import numpy as np
@@ -171,9 +170,7 @@ class ArrayLayout:
 
 class EpochFinder:
     def __init__(self, kinds: list[int], info_id: int, jump_us: int, patience_us: int) -> None: ...
-    def load(
-        self, buffer: bytes, records: bytes, times_us: NDArray[np.uint64] | array.array[int]
-    ) -> None: ...
+    def load(self, buffer: bytes, records: bytes, times_us: NDArray[np.uint64] | int) -> None: ...
     def take(
         self, array: ArrayLayout, time_us: int, sequence: int, heard_us: int, most: int
     ) -> (

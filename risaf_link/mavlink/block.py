@@ -13,7 +13,6 @@ last one, a HEARTBEAT of what is no autopilot) parts no block: it is handed on w
 The kernel finds the epochs. Where it was not built, every frame is handed on alone.
 """
 
-from array import array
 from collections.abc import Collection, Iterator
 from enum import IntEnum
 
@@ -88,15 +87,15 @@ class BlockReader:
             )
 
     def read(
-        self, table: FrameTable, times_us: "Stamps | array[int]"
+        self, table: FrameTable, times_us: Stamps | int
     ) -> Iterator[EpochBlock | tuple[Frame, int]]:
         """Read the next frames of a log.
 
         Parameters
         ----------
         table : FrameTable
-        times_us : ndarray or array of uint64
-            When each frame was received.
+        times_us : ndarray of uint64, or int
+            When each frame was received, or all of them.
 
         Yields
         ------
@@ -106,7 +105,7 @@ class BlockReader:
         """
         if self._finder is None:
             rows = np.flatnonzero(np.isin(table.cuts["message_id"], np.flatnonzero(self._kinds)))
-            yield from ((table.frame(row), int(times_us[row])) for row in rows.tolist())
+            yield from (_timed(table, row, times_us) for row in rows.tolist())
             return
         self._finder.load(table.buffer, table.records, times_us)
         while True:
@@ -115,7 +114,7 @@ class BlockReader:
             if block is not None:
                 done, idle = 0, list[tuple[Frame, int]]()
                 for row, before in block.asides:
-                    aside = table.frame(row), int(times_us[row])
+                    aside = _timed(table, row, times_us)
                     if _is_idle(aside[0]):
                         idle.append(aside)
                         continue
@@ -135,7 +134,7 @@ class BlockReader:
             if row == len(table):
                 return
             self._steady = None
-            yield table.frame(row), int(times_us[row])
+            yield _timed(table, row, times_us)
 
     @property
     def is_steady(self) -> bool:
@@ -187,16 +186,19 @@ class BlockReader:
             )
 
 
+def _timed(table: FrameTable, row: int, times_us: Stamps | int) -> tuple[Frame, int]:
+    """A frame, and when it was received."""
+    return table.frame(row), times_us if isinstance(times_us, int) else int(times_us[row])
+
+
 def _columns(values: bytes, k: int, gyros: int, forces: int) -> Columns:
     """Columns of k epochs out of what the kernel made of them."""
-    times_us, numbers = np.frombuffer(values, np.int64, 2 * k), np.frombuffer(values)[2 * k :]
-    rates_end = k + 3 * k * gyros
     return (
-        times_us[:k],
-        numbers[:k],
-        numbers[k:rates_end].reshape(k, gyros, 3),
-        numbers[rates_end:].reshape(k, forces, 3),
-        times_us[k:],
+        np.ndarray(k, np.int64, values),
+        np.ndarray(k, float, values, 16 * k),
+        np.ndarray((k, gyros, 3), float, values, 24 * k),
+        np.ndarray((k, forces, 3), float, values, 24 * k * (1 + gyros)),
+        np.ndarray(k, np.int64, values, 8 * k),
     )
 
 

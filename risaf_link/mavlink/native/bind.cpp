@@ -6,6 +6,7 @@
 
 #include <map>
 #include <optional>
+#include <vector>
 
 #include "epochs.hpp"
 #include "frames.hpp"
@@ -63,16 +64,18 @@ class EpochFinder {
               std::uint64_t patience_us)
       : finder_(std::move(kinds), info_id, jump_us, patience_us) {}
 
-  void load(nb::bytes buffer, nb::bytes records, Column<std::uint64_t> times_us) {
-    const std::size_t size = times_us.shape(0);
-    if (records.size() != size * sizeof(risaf::Cut)) {
+  void load(nb::bytes buffer, nb::bytes records, const Column<std::uint64_t>& times_us) {
+    if (records.size() != times_us.shape(0) * sizeof(risaf::Cut)) {
       throw nb::value_error("records: not as many as times");
     }
-    finder_.load(data(buffer), reinterpret_cast<const risaf::Cut*>(data(records)), times_us.data(),
-                 size);
-    buffer_ = std::move(buffer);
-    records_ = std::move(records);
-    times_us_ = std::move(times_us);
+    times_us_.assign(times_us.data(), times_us.data() + times_us.shape(0));
+    load_timed(std::move(buffer), std::move(records));
+  }
+
+  // Frames that were received all at once.
+  void load_at_once(nb::bytes buffer, nb::bytes records, std::uint64_t time_us) {
+    times_us_.assign(records.size() / sizeof(risaf::Cut), time_us);
+    load_timed(std::move(buffer), std::move(records));
   }
 
   // Of the columns of an EpochBlock, first times and arrivals, int64, then what is double.
@@ -90,7 +93,7 @@ class EpochFinder {
     auto* dt = reinterpret_cast<double*>(times + 2 * size);
     for (std::size_t i = 0; i < size; ++i) {
       times[i] = epochs[i].time_us;
-      times[size + i] = static_cast<std::int64_t>(times_us_.data()[epochs[i].end]);
+      times[size + i] = static_cast<std::int64_t>(times_us_[epochs[i].end]);
       dt[i] = static_cast<double>(epochs[i].time_us - time_us) / 1e6;
       time_us = epochs[i].time_us;
     }
@@ -101,7 +104,7 @@ class EpochFinder {
       asides.append(nb::make_tuple(aside.row, aside.before));
     }
     const auto& last = epochs.back();
-    const auto came_us = [this](std::size_t row) { return times_us_.data()[row]; };
+    const auto came_us = [this](std::size_t row) { return times_us_[row]; };
     return nb::make_tuple(size, columns,
                           nb::make_tuple(came_us(last.newest), came_us(last.begun),
                                          came_us(last.heard)),
@@ -114,9 +117,16 @@ class EpochFinder {
   std::size_t single() { return finder_.single(); }
 
  private:
+  void load_timed(nb::bytes buffer, nb::bytes records) {
+    finder_.load(data(buffer), reinterpret_cast<const risaf::Cut*>(data(records)), times_us_.data(),
+                 times_us_.size());
+    buffer_ = std::move(buffer);
+    records_ = std::move(records);
+  }
+
   risaf::EpochFinder finder_;
   nb::object buffer_, records_;
-  Column<std::uint64_t> times_us_;
+  std::vector<std::uint64_t> times_us_;
 };
 
 }  // namespace
@@ -142,6 +152,7 @@ void bind_frames(nb::module_& m) {
       .def(nb::init<std::vector<std::uint8_t>, std::uint32_t, std::int64_t, std::uint64_t>(),
            "kinds"_a, "info_id"_a, "jump_us"_a, "patience_us"_a)
       .def("load", &EpochFinder::load, "buffer"_a, "records"_a, "times_us"_a)
+      .def("load", &EpochFinder::load_at_once, "buffer"_a, "records"_a, "time_us"_a)
       .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a,
            "heard_us"_a, "most"_a)
       .def("single", &EpochFinder::single);
