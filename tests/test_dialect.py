@@ -172,6 +172,11 @@ def test_a_message_is_laid_out_as_pymavlink_lays_it_out(name, data):
     assert pack(name, **fields) == (IDS[name], payload)
 
 
+def test_a_message_of_one_field_is_laid_out_as_well():
+    assert pack("MISSION_ITEM_REACHED", seq=7) == (IDS["MISSION_ITEM_REACHED"], b"\7\0")
+    assert pack("AUTH_KEY", key="abc") == (IDS["AUTH_KEY"], b"abc".ljust(32, b"\0"))
+
+
 def test_a_text_may_be_given_as_text():
     fields = dict.fromkeys(CLASSES["IMU_ARRAY_INFO"].fieldnames, 0)
     _, payload = pack("IMU_ARRAY_INFO", **{**fields, "name": "bench"})

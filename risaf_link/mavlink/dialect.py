@@ -4,9 +4,8 @@ The definitions come from the dialect modules that mavgen generates. Only their 
 (names, field order, CRC_EXTRA, struct layout); framing is in `frame`.
 """
 
-import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from operator import itemgetter
 from typing import Any
@@ -14,8 +13,6 @@ from typing import Any
 from pymavlink.dialects.v20 import all as public_dialect
 
 from risaf_link.mavlink import risaf
-
-_Pick = Callable[[dict[str, Any]], tuple[Any, ...]]
 
 
 class ComponentInformationBasic:
@@ -119,26 +116,22 @@ def pack(name: str, /, **fields: Any) -> tuple[int, bytes]:
     struct.error
         If a value does not fit its field.
     """
-    message_id, expected, pick, texts, arrays, packer = _layout(name)
+    message_id, expected, ordered, arrays, packer = _layout(name)
     if fields.keys() != expected:
         raise TypeError(f"{name}: fields {sorted(fields)}, expected {sorted(expected)}")
-    values = list(pick(fields))
-    for i in texts:
-        values[i] = values[i].encode() if isinstance(values[i], str) else values[i]
+    values = [v.encode() if isinstance(v := fields[field], str) else v for field in ordered]
     for i in arrays:
         values[i : i + 1] = values[i]
     return message_id, packer.pack(*values)
 
 
 @cache
-def _layout(name: str) -> tuple[int, frozenset[str], _Pick, list[int], list[int], struct.Struct]:
-    """Id and fields of a message; which are text, and which arrays, the last one first."""
+def _layout(name: str) -> tuple[int, frozenset[str], Sequence[str], list[int], struct.Struct]:
+    """Id and fields of a message; its fields as they are laid out; arrays, the last one first."""
     message = MESSAGES[IDS[name]]
-    pick = itemgetter(*message.ordered_fieldnames)
-    formats = re.findall(r"\d*[a-zA-Z]", message.unpacker.format)
-    texts = [i for i, each in enumerate(formats) if each.endswith("s")]
+    ordered = message.ordered_fieldnames
     arrays = [i for i, length in enumerate(message.lengths) if length > 1]
-    return message.id, frozenset(message.fieldnames), pick, texts, arrays[::-1], message.unpacker
+    return message.id, frozenset(ordered), ordered, arrays[::-1], message.unpacker
 
 
 def _position(message: Any, field: str) -> int | slice:
