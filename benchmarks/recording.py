@@ -5,7 +5,6 @@ python benchmarks/recording.py --rounds 5
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from statistics import median, quantiles
 
 from killed import child
 
-from risaf_link.bench.live import Course, Meter, drive, memory_mb
+from risaf_link.bench.live import Course, Meter, drive, memory_mb, worked_s
 from risaf_link.links import recorder
 from risaf_link.links.tlog import Pipes
 from risaf_link.sim.scenario import scenario
@@ -54,20 +53,14 @@ def course(
         try:
             with service(meter, Path(folder), rate, recorded) as process:
                 writer = child(process) if recorded else None
-                began, worked_s = time.perf_counter(), _worked_s(writer)
+                began, before_s = time.perf_counter(), worked_s(writer) if writer else 0.0
                 one = drive(meter, process, chosen, seconds)
                 passed_s = time.perf_counter() - began
-                share = 100.0 * (_worked_s(writer) - worked_s) / passed_s
+                after_s = worked_s(writer) if writer else 0.0
+                share = 100.0 * (after_s - before_s) / passed_s
                 return one, share, memory_mb(writer) if writer else 0.0
         finally:
             meter.close()
-
-
-def _worked_s(process: int | None) -> float:
-    if process is None:
-        return 0.0
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def compare(sensors: int, rate: float, seconds: float, rounds: int) -> None:

@@ -14,11 +14,10 @@ import argparse
 import gc
 import time
 from contextlib import ExitStack
-from pathlib import Path
 from statistics import quantiles
 
 from risaf_link.bench.feed import bursts
-from risaf_link.bench.live import SEED, Meter, rival, service
+from risaf_link.bench.live import SEED, Meter, rival, service, worked_s
 from risaf_link.bench.reading import COMMAND
 from risaf_link.sim.scenario import scenario
 
@@ -67,11 +66,6 @@ def main() -> None:
             f"{name:20} {shares[name]:10.2%} {shares[name] / shares[REFERENCE]:18.2f} "
             f"{percentiles[49]:8.0f} {percentiles[98]:8.0f}"
         )
-
-
-def worked_s(process: int) -> float:
-    """Time of a core that a process has taken, s, to the nanosecond."""
-    return int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) / 1e9
 
 
 if __name__ == "__main__":

@@ -173,7 +173,7 @@ def drive(meter: Meter, process: int, chosen: Scenario, seconds: float) -> Cours
     due = bursts(chosen, seconds)
     gc.disable()
     try:
-        worked_s, began = _worked_s(process), time.perf_counter()
+        before_s, began = worked_s(process), time.perf_counter()
         for burst in due:
             while (left := began + burst.due_s - time.perf_counter()) > 0:
                 meter.hear(left)
@@ -184,7 +184,7 @@ def drive(meter: Meter, process: int, chosen: Scenario, seconds: float) -> Cours
             if not course.memory_mb and burst.due_s >= seconds / 4:
                 course.memory_mb.append(memory_mb(process))
         passed = time.perf_counter() - began
-        course.core_percent = 100.0 * (_worked_s(process) - worked_s) / passed
+        course.core_percent = 100.0 * (worked_s(process) - before_s) / passed
         until = time.perf_counter() + LINGER_S
         while time.perf_counter() < until:
             meter.hear(0.01)
@@ -308,7 +308,7 @@ def memory_mb(process: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def _worked_s(process: int) -> float:
+def worked_s(process: int) -> float:
     """Time of a core that a process has taken, s."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
