@@ -189,8 +189,7 @@ class Pipeline:
 
     def advance(self, epochs: EpochBlock) -> list[EstimateBlock]:
         """Carry the estimate on over epochs that ingest and assembler have handed on already."""
-        before = self.release() if self._waiting else []
-        return before + self._advance(epochs)
+        return [*self.release(), *self._advance(epochs)]
 
     def _wait(self, epochs: list[Epoch], received_us: int) -> None:
         self._waiting += [(epoch, received_us) for epoch in epochs]

@@ -231,8 +231,7 @@ class Service:
                 estimate = block.at(i)
                 self._component.observe(estimate)
                 self._hand_out(self._component.emit(estimate, peers))
-                if self._outputs.running:
-                    self._outputs.take(estimate, received_us, self._began_ns)
+                self._outputs.take(estimate, received_us, self._began_ns)
 
     def _peers(self) -> list[Peer]:
         return [(link.name, peer) for link in self.links for peer in link.peers]

@@ -223,12 +223,11 @@ class HeadingFinder:
         """
         previous, self._previous = self._previous, (fix, time_s)
         by_positions = self._parameters.source.startswith("positions")
-        track = UNKNOWN_TRACK
-        if by_positions or not (math.isfinite(fix.speed) and math.isfinite(fix.course)):
-            track = self._track(previous, fix, time_s)
+        by_velocity = math.isfinite(fix.course) and math.isfinite(fix.speed) and not by_positions
+        track = UNKNOWN_TRACK if by_velocity else self._track(previous, fix, time_s)
         by_track = by_positions or math.isnan(fix.speed)
         polar = abs(fix.latitude) > POLAR_CAP
-        heading = self._choose(fix, track, time_s)
+        heading = self._choose(fix, by_velocity, track, time_s)
         return Motion(
             track.speed if by_track else fix.speed,
             None if polar else heading,
@@ -244,7 +243,9 @@ class HeadingFinder:
         told = self._parameters.course_is_heading
         return fix.course_is_heading if told == "auto" else told == "always"
 
-    def _choose(self, fix: GpsFix, track: Motion, time_s: float) -> Heading | None:
+    def _choose(
+        self, fix: GpsFix, by_velocity: bool, track: Motion, time_s: float
+    ) -> Heading | None:
         source = self._parameters.source
         if source in {"auto", "dual_antenna"} and math.isfinite(fix.yaw):
             self._yaw_s = time_s
@@ -255,7 +256,6 @@ class HeadingFinder:
         awaited = source == "auto" and time_s - self._yaw_s < ANTENNA_PATIENCE
         if source == "dual_antenna" or awaited or not self._goes_ahead(fix):
             return None
-        by_velocity = math.isfinite(fix.course) and math.isfinite(fix.speed)
         if source == "velocity" or (source == "auto" and by_velocity):
             return self._from_velocity(fix) if by_velocity else None
         return track.heading
@@ -392,7 +392,6 @@ class HeadingMonitor:
         self._fused_s = math.nan
         self._fused_count = 0
         self._rejected_count = 0
-        self._with_fix = self._states()
 
     def configure(self, parameters: HeadingParameters) -> None:
         """Take new parameters; what was learnt stays."""
@@ -416,7 +415,7 @@ class HeadingMonitor:
             self._rejected_count,
             self._fused_s,
             self._fix_s + self._parameters.timeout,
-            self._with_fix,
+            self._with_fix(),
             elapsed,
             aligned,
         )
@@ -425,7 +424,6 @@ class HeadingMonitor:
         """Take note of a usable fix."""
         self._fix_s = self._elapsed
         self._motion = motion
-        self._with_fix = self._states()
 
     def note_innovation(self, heading: Heading, innovation: Innovation) -> None:
         """Take note of what the filter made of a heading."""
@@ -435,10 +433,8 @@ class HeadingMonitor:
             self._fused_s = self._elapsed
         else:
             self._rejected_count += 1
-        self._with_fix = self._states()
 
-    def _states(self) -> States:
-        """While there is a fix."""
+    def _with_fix(self) -> States:
         if self._motion.heading is None:
             return HeadingState.TOO_SLOW, HeadingState.TOO_SLOW
         if self._innovation is None or self._innovation.reset:

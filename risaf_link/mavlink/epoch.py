@@ -123,7 +123,7 @@ class EpochAssembler:
         self._newest: GyroChunk | None = None
         self._astray: list[GyroChunk] = []
         self.last: GyroChunk | None = None
-        self._last_received_us: int | None = None  # likewise, by any clock
+        self._last_received_us: int | None = None  # when it came, by any clock of the array
         self._last_size = 0
         self._steps_us: deque[int] = deque(maxlen=STEPS)
 

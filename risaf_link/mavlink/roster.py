@@ -67,8 +67,6 @@ class Roster:
         How many there are, as the array says; 0: it has not said.
     awaited : ndarray of bool, shape (n,)
         Who came, of late, more than half as often as the most regular one of the array.
-    size : int
-        How many sensors there are.
     expected : int
         How many belong to a complete epoch: who is awaited, and all that are told of.
     open, gone : dict of int to Instant
@@ -84,6 +82,11 @@ class Roster:
         self._whole = 0  # epochs
         self._seen = 0  # the last sensor that came of late, plus one
         self._await(np.ones(told, dtype=bool))
+
+    @property
+    def size(self) -> int:
+        """How many sensors there are."""
+        return len(self.awaited)
 
     @property
     def attended(self) -> NDArray[np.int64]:
@@ -117,8 +120,7 @@ class Roster:
     def close(self, time_us: int) -> Instant:
         """Hand on what was read at a time."""
         instant = self.gone[time_us] = self.open.pop(time_us)
-        if len(self.gone) >= 2 * REMEMBERED:
-            self._forget_old()
+        self._forget_old()
         return instant
 
     def close_whole(self, times_us: list[int]) -> None:
@@ -128,13 +130,13 @@ class Roster:
         self._seen = max(self._seen, self.size)
         self._whole += len(times_us)
         self.gone.update(dict.fromkeys(times_us, self.size))
-        if len(self.gone) >= 2 * REMEMBERED:
-            self._forget_old()
+        self._forget_old()
 
     def _forget_old(self) -> None:
-        """Keep half of the instants handed on."""
-        keep = REMEMBERED + len(self.gone) % REMEMBERED
-        self.gone = dict(list(self.gone.items())[-keep:])
+        """Keep half of the instants handed on whenever there are twice as many as needed."""
+        if len(self.gone) >= 2 * REMEMBERED:
+            keep = REMEMBERED + len(self.gone) % REMEMBERED
+            self.gone = dict(list(self.gone.items())[-keep:])
 
     def recall(self, time_us: int) -> Instant | None:
         """What was handed on of late that had been read at a time."""
@@ -184,7 +186,7 @@ class Roster:
         self._await(fitted(self.awaited, size, True))
 
     def _await(self, awaited: Mask) -> None:
-        self.awaited, self._expected, self.size = awaited, awaited.copy(), len(awaited)
+        self.awaited, self._expected = awaited, awaited.copy()
         self._expected[: self.told] = True
         self._quorum = int(np.count_nonzero(awaited))
         self.expected = int(np.count_nonzero(self._expected))

@@ -133,8 +133,8 @@ class Emitter:
             period = math.floor(estimate.time_us * rate / 1e6)
             if period != self._periods.get(name):
                 self._periods[name] = period
-                if name != "ODOMETRY" or self.can_tell(name, estimate):
-                    frames.append(self.frame(name, **self.fields(name, estimate)))
+                if self.can_tell(name, estimate):
+                    frames.append(self.tell(name, estimate))
         return frames
 
     def can_tell(self, name: Message, estimate: Estimate) -> bool:
