@@ -439,6 +439,12 @@ class TestSpoiled:
                 return
         assert_same(log, (1 << 20, 3_000), **parameters)
 
+    def test_accelerometers_that_a_review_finds_too_seldom_to_be_waited_for(self):
+        log = Log(0, 260)
+        silence_forces(log, 0, 1)
+        resize(log, round(0.75 * len(log.sent)), 1)
+        assert_same(log, (1 << 20, 3_000))
+
     def test_a_size_that_shrinks_by_silence(self):
         log = Log(7, 2 * SHRINK_AFTER + 300, 4, 0, 2)
         log.sent = [s for s in log.sent if "INFO" not in s[1]]

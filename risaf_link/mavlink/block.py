@@ -79,7 +79,7 @@ class BlockReader:
         self._kinds = _kinds(ingest, apart)
         self._layout: native.ArrayLayout
         self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
-        self._steady: bool | None = None  # None: a frame has been handed on since it was known
+        self._steady: bool | None = None  # None: a frame was handed on, or it was reviewed, since
         self._finder: native.EpochFinder | None = None
         if native:
             self._finder = native.EpochFinder(
@@ -169,6 +169,8 @@ class BlockReader:
         block = RegularEpochs(*columns, newest, begun, last_row + 1, asides)
         self._ingest.take_block(heard_us, *unusable, map(table.frame, refused))
         self._assembler.take_block(block)
+        if self._assembler.until_review == REVIEW:  # other sensors may be waited for from now on
+            self._steady = None
         return block
 
     def _lay_out(self, source: Source, info: ArrayInfo) -> None:
