@@ -130,9 +130,7 @@ class Receiver:
         config = load(None)
         self.pipeline = kind(config, config.own)
         self.frames = 0
-        self._blocks = BlockReader(
-            self.pipeline.ingest, self.pipeline.assembler, apart=HEARD, longest=1
-        )
+        self._blocks = BlockReader(self.pipeline.ingest, self.pipeline.assembler, apart=HEARD)
         self._parsers: dict[str, FrameParser] = {}
 
     def dropped(self) -> Counter[str]:
@@ -145,7 +143,7 @@ class Receiver:
         table = parser.receive_table(data)
         self.frames += len(table)
         found: list[EstimateBlock] = []
-        for item in self._blocks.read(table, np.full(len(table), received_us, np.uint64)):
+        for item in self._blocks.read(table, received_us, longest=1):
             if isinstance(item, EpochBlock):
                 found += self.pipeline.advance(item)
             else:

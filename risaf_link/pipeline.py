@@ -191,6 +191,45 @@ class Pipeline:
         """Carry the estimate on over epochs that ingest and assembler have handed on already."""
         return [*self.release(), *self._advance(epochs)]
 
+    @property
+    def may_go_ahead(self) -> bool:
+        """Whether nothing but readings bears on the next epoch."""
+        calibration, assembler = self._calibration, self.assembler
+        return (
+            not self._waiting
+            and not self._start.is_on_trial
+            and (calibration is None or self._fits(calibration, assembler.sensors))
+            and self.ingest.delay_of(assembler.source) == self._delay
+        )
+
+    def go_ahead(
+        self, time_us: int, received_us: int, dt: float, readings: bytes
+    ) -> tuple[int, bytes] | None:
+        """Carry fusion and filter on over an epoch that `advance` is given later.
+
+        It is given all such epochs in one block, and nothing else is asked for before.
+
+        Parameters
+        ----------
+        time_us, received_us, dt
+            As in an `EpochBlock`.
+        readings : bytes
+            Its rates_b, and behind them forces_b.
+
+        Returns
+        -------
+        int and bytes, or None
+            The epoch's stamp on the vehicle's boot clock, us, and its row of the track. None:
+            there is no kernel for that, and nothing has been done.
+        """
+        n = self.assembler.sensors
+        if self._calibration:
+            values = np.frombuffer(readings).reshape(1, -1, 3)
+            corrected = self._calibration.apply(values[:, :n], values[:, n:])
+            readings = b"".join(each.tobytes() for each in corrected)
+        row = self._start.estimator.go_ahead(dt, readings, n)
+        return None if row is None else (self._clock.stamp(time_us, received_us), row)
+
     def _wait(self, epochs: list[Epoch], received_us: int) -> None:
         self._waiting += [(epoch, received_us) for epoch in epochs]
 

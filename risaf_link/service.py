@@ -12,6 +12,7 @@ from risaf_link.config import Config, identity_of, load_calibration
 from risaf_link.core.estimate import EstimateBlock
 from risaf_link.core.fusion import EpochBlock
 from risaf_link.core.kernel import BUILT
+from risaf_link.core.memory import Memory
 from risaf_link.gate import Gate
 from risaf_link.gibberish import Gibberish
 from risaf_link.kept import NOTHING_KEPT, KeptParameters
@@ -30,6 +31,7 @@ from risaf_link.mavlink.peers import Terms
 from risaf_link.mavlink.requests import Requests
 from risaf_link.mavlink.signing import SETUP_SIGNING
 from risaf_link.pipeline import Pipeline
+from risaf_link.prompt import Prompt
 from risaf_link.publish.account import Account, Traffic
 from risaf_link.publish.outputs import open_outputs
 from risaf_link.remembered import MemoryKeeper, memory_file
@@ -82,7 +84,7 @@ class Service:
             file.keep_used()
         calibration = load_calibration(config)
         self.pipeline = Pipeline(parameters.tuned, config.own, calibration, memory)
-        self._keeper = MemoryKeeper(file, config.state.period, self.pipeline.memory)
+        self._keeper = MemoryKeeper(file, config.state.period, self._memory)
         self.links = [
             open_link(link.url, link.name, clock_us, link.recording) for link in config.links
         ]
@@ -111,12 +113,12 @@ class Service:
         self._by_name = {link.name: link for link in self.links}
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
-        self._blocks = BlockReader(
-            self.pipeline.ingest, self.pipeline.assembler, apart=HEARD, longest=1
-        )
+        self._blocks = BlockReader(self.pipeline.ingest, self.pipeline.assembler, apart=HEARD)
+        self._prompt = Prompt(self.pipeline, self._blocks, self._component)
         self._held = Held()
         self._gibberish = Gibberish()
         self._holding: Peer = ("", "")  # whose datagrams wait
+        self._has_accounted = False  # since the last beat
         self._frames = 0
         self._received_us = 0
         self._began_ns = 0  # when that was, on the clock of latencies
@@ -177,33 +179,66 @@ class Service:
             self._holding = sender
         if self._held.holds(data):
             return Worth.UNKNOWN
+        self._began_ns = time.perf_counter_ns()
+        self._received_us = self._clock_us() & ~3  # as a recording keeps it
+        if self._held.is_whole and self._answer([*self._held.parts, data], sender):
+            self._held.take()
+            return Worth.SAMPLES
+        self._take_account()
         worth = self._take(self._held.take(data), sender)
         self._held.note_end(self._blocks.is_steady)
         return worth
 
+    def _answer(self, frames: list[bytes], sender: Peer) -> bool:
+        """Answer an epoch before account is taken of it, if that can be."""
+        if self._outputs.running or sender[0] in self._keys.links:  # they look at each by itself
+            return False
+        if not self._prompt and not self._parser(*sender).is_between_frames:
+            return False
+        answers = self._prompt.answer(frames, self._received_us, self._peers())
+        if answers is None:
+            return False
+        self._record(frames, self._received_us)
+        self._hand_out(answers)
+        if self._prompt.is_more_due:
+            self._take_account()
+        return True
+
+    def _take_account(self) -> None:
+        """Take account of the epochs that were answered, if any were."""
+        self._has_accounted = True
+        if not self._prompt:
+            return
+        frames, times_us = self._prompt.take()
+        table = self._parser(*self._holding).receive_table(frames)
+        self._gibberish.note(self._holding[0], len(table))
+        self._note(table, self._holding)
+        for item in self._blocks.read(table, times_us):
+            if not isinstance(item, EpochBlock):
+                raise TypeError("block: found a frame, expected the epochs that were answered")
+            self._send(self.pipeline.advance(item), told=len(item) - self._prompt.is_more_due)
+
     def _take_held(self) -> None:
         """Take what waits, if anything does."""
+        self._take_account()
         if self._held:
+            self._began_ns = time.perf_counter_ns()
+            self._received_us = self._clock_us() & ~3
             self._take(self._held.take(), self._holding)
 
     def _take(self, data: bytes, sender: Peer) -> Worth:
-        before_us = self.pipeline.ingest.heard_us
-        self._began_ns = time.perf_counter_ns()
-        self._received_us = received_us = self._clock_us() & ~3  # as a recording keeps it
+        before_us, received_us = self.pipeline.ingest.heard_us, self._received_us
         self._keys.advance(received_us)
         cut = self._parser(*sender).receive_table(data)
         self._gibberish.note(sender[0], len(cut))
         table = self._gate.admitted(cut, sender, received_us)
-        count = len(table)
-        if not count:  # garbage costs no more than that
+        if not len(table):  # garbage costs no more than that
             return Worth.NOTHING
-        self._frames += count
-        self._frames_in[sender[0]] += count
         if self._recordings:
-            self._record(table, received_us)
-        self._component.note_traffic(table, sender)
+            self._record(table.raw(but=SETUP_SIGNING), received_us)
+        self._note(table, sender)
         are_answers_due = False
-        for item in self._blocks.read(table, received_us):
+        for item in self._blocks.read(table, received_us, longest=1):
             if isinstance(item, EpochBlock):
                 self._send(self.pipeline.advance(item))
             else:
@@ -218,20 +253,26 @@ class Service:
             return Worth.SAMPLES
         return self._gate.worth(table, sender[0])
 
-    def _record(self, table: FrameTable, received_us: int) -> None:
-        """Record what was taken, but for keys."""
-        frames = table.raw(but=SETUP_SIGNING)
+    def _note(self, table: FrameTable, sender: Peer) -> None:
+        """Take note of frames that were taken."""
+        self._frames += len(table)
+        self._frames_in[sender[0]] += len(table)
+        self._component.note_traffic(table, sender)
+
+    def _record(self, frames: list[bytes], received_us: int) -> None:
         for recording in self._recordings:
             recording.record(received_us, *frames)
 
-    def _send(self, blocks: list[EstimateBlock]) -> None:
+    def _send(self, blocks: list[EstimateBlock], told: int = 0) -> None:
+        """Take what came of epochs, and send what is due at all but the first, which are told."""
         for block in blocks:
             peers = self._peers()
             for i, received_us in enumerate(block.received_us.tolist()):
                 estimate = block.at(i)
                 self._component.observe(estimate)
-                self._hand_out(self._component.emit(estimate, peers))
-                self._outputs.take(estimate, received_us, self._began_ns)
+                if i >= told:
+                    self._hand_out(self._component.emit(estimate, peers))
+                    self._outputs.take(estimate, received_us, self._began_ns)
 
     def _peers(self) -> list[Peer]:
         return [(link.name, peer) for link in self.links for peer in link.peers]
@@ -240,6 +281,10 @@ class Service:
         for (link, peer), raw in frames:
             self._by_name[link].send_to(raw, peer)
             self._frames_out[link] += 1
+
+    def _memory(self) -> Memory | None:
+        self._take_account()
+        return self.pipeline.memory()
 
     def _keep(self, parameters: dict[str, float]) -> None:
         """Store parameters without waiting: a memory card can take longer than an epoch."""
@@ -278,6 +323,7 @@ class Service:
 
     def account(self) -> Account:
         """What has come and gone, as of now."""
+        self._take_account()
         return Account(
             dropped=self.dropped,
             rejected=self.rejected,
@@ -335,24 +381,30 @@ class Service:
                 break
             await asyncio.sleep(TICK_S / OPENING)
         while True:
-            self._take_held()
-            self._look_after_keys(loop.time())
-            self._look_after_state(loop.time())
-            self._tell_gibberish(loop.time())
-            self._tell_mismatch()
-            self._tell_recalled()
-            now_us = round(loop.time() * 1e6)
-            gathered = self.pipeline.assembler.counts["epochs"]
-            is_alive = self._component.note_gathered(gathered, now_us)
-            for recording in self._recordings:
-                self._component.complaints[f"recording {recording.name}"] = recording.trouble
-            self._component.advance(now_us, self._clock_us())
-            self._hand_out(self._component.collect(self._peers()))
-            self._supervisor.tell(loop.time(), lambda: self._component.status, is_alive)
+            now_s = loop.time()
+            self._do_what_is_due(now_s)
             await asyncio.sleep(TICK_S)
-            late_s = loop.time() - now_us / 1e6 - TICK_S
+            late_s = loop.time() - now_s - TICK_S
             if late_s > STALLED_S:
                 _log.warning("stood still for %d s", round(late_s))
+
+    def _do_what_is_due(self, now_s: float) -> None:
+        if self._held or not self._has_accounted:
+            self._take_held()
+        self._has_accounted = False  # what is answered from now on waits for two beats at most
+        self._look_after_keys(now_s)
+        self._look_after_state(now_s)
+        self._tell_gibberish(now_s)
+        self._tell_mismatch()
+        self._tell_recalled()
+        now_us = round(now_s * 1e6)
+        gathered = self.pipeline.assembler.counts["epochs"]
+        is_alive = self._component.note_gathered(gathered, now_us)
+        for recording in self._recordings:
+            self._component.complaints[f"recording {recording.name}"] = recording.trouble
+        self._component.advance(now_us, self._clock_us())
+        self._hand_out(self._component.collect(self._peers()))
+        self._supervisor.tell(now_s, lambda: self._component.status, is_alive)
 
 
 def _pace(link: Link) -> float:

@@ -475,3 +475,69 @@ def test_frames_that_mean_nothing_to_the_pipeline_are_left_out():
     table = parser.receive_table(raw)
     items = list(reader.read(table, np.zeros(len(table), np.uint64)))
     assert [frame.message_id for frame, _ in items] == [IDS["HEARTBEAT"]]
+
+
+class TestNext:
+    """The next epoch alone."""
+
+    @pytest.fixture
+    def reader(self):
+        """One that has read thirty epochs of `LOG`."""
+        reading = Reading()
+        reader = BlockReader(reading.ingest, reading.assembler)
+        if reader._finder is None:
+            pytest.skip("no kernel was built: that takes a C++ compiler")
+        for table, times_us in TlogReader([Log(0, 30).raw()]).tables():
+            for item in reader.read(table, times_us):
+                if not isinstance(item, EpochBlock):
+                    reading.step(*item)
+        return reader
+
+    def next(self, reader, *frames, ago=0):
+        time_us, sequence = reader._assembler.last.time_us, reader._assembler.last.sequence
+        return reader.next(b"".join(frames), time_us - ago * PERIOD_US, sequence - ago)
+
+    def test_it_is_what_a_block_has(self, reader):
+        time_us, dt, readings = self.next(reader, *frames_of(30))
+        for table, times_us in TlogReader([stamped(frames_of(30))]).tables():
+            (block,) = reader.read(table, times_us)
+        assert (time_us, dt) == (block.time_us[0], block.dt[0])
+        assert readings == block.rates_b.tobytes() + block.forces_b.tobytes()
+
+    def test_what_is_more_less_or_other_is_not(self, reader):
+        epoch, info = frames_of(30), framed("IMU_ARRAY_INFO", told(5, 3), ARRAY)
+        broken = bytearray(epoch[0])
+        broken[20] ^= 1
+        for frames in (
+            [],
+            epoch[:-1],
+            epoch[1:],
+            epoch[::-1],
+            [*epoch, epoch[-1]],
+            [*epoch, *frames_of(31)],
+            [*epoch, info],
+            [info, *epoch],
+            [*epoch, b"\0"],
+            [b"\0", *epoch],
+            [*epoch, epoch[0][:30]],
+            [broken, *epoch[1:]],
+            frames_of(29),
+            frames_of(31),
+        ):
+            assert self.next(reader, *map(bytes, frames)) is None
+        assert self.next(reader, *epoch) is not None
+
+    def test_nothing_is_taken(self, reader):
+        assert self.next(reader, *frames_of(30)) == self.next(reader, *frames_of(30))
+        assert self.next(reader, *frames_of(29), ago=1) is not None
+
+
+def frames_of(epoch):
+    """Frames of the array at one epoch of `Log(0)`, each."""
+    log = Log(0, 0)
+    sent = (each for each in log.frames(epoch) if each[1] in ("GYRO_ARRAY", "ACCEL_ARRAY"))
+    return [framed(*each[1:]) for each in sent]
+
+
+def stamped(frames):
+    return b"".join(record(START_US, raw) for raw in frames)

@@ -11,7 +11,7 @@ from pymavlink.generator import mavgen, mavparse
 from streams import CLASSES, OURS, ROOT, STOCK, codec, message, payloads
 
 from risaf_link.mavlink import risaf
-from risaf_link.mavlink.dialect import CRC_EXTRA, IDS, MESSAGES, name_of, pack, reader
+from risaf_link.mavlink.dialect import CRC_EXTRA, IDS, MESSAGES, name_of, pack, reader, writer
 from risaf_link.mavlink.frame import encode
 
 DEFINITION = ROOT / "risaf_link" / "mavlink" / "risaf.xml"
@@ -175,6 +175,18 @@ def test_a_message_is_laid_out_as_pymavlink_lays_it_out(name, data):
 def test_a_message_of_one_field_is_laid_out_as_well():
     assert pack("MISSION_ITEM_REACHED", seq=7) == (IDS["MISSION_ITEM_REACHED"], b"\7\0")
     assert pack("AUTH_KEY", key="abc") == (IDS["AUTH_KEY"], b"abc".ljust(32, b"\0"))
+
+
+def test_a_writer_lays_out_what_pack_lays_out():
+    write = writer("ATTITUDE_QUATERNION", "time_boot_ms", "q1", "q2")
+    zeros = dict.fromkeys(("q3", "q4", "rollspeed", "pitchspeed", "yawspeed"), 0.0)
+    told = {"time_boot_ms": 7, "q1": 0.5, "q2": -0.25, "repr_offset_q": [0.0] * 4}
+    assert write(7, 0.5, -0.25) == pack("ATTITUDE_QUATERNION", **told, **zeros)
+
+
+def test_a_writer_takes_fields_in_the_order_of_the_wire_alone():
+    with pytest.raises(ValueError, match=r"ATTITUDE_QUATERNION: fields .*, expected the first of"):
+        writer("ATTITUDE_QUATERNION", "q1", "time_boot_ms")
 
 
 def test_a_text_may_be_given_as_text():

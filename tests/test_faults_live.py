@@ -102,12 +102,12 @@ async def test_a_wrong_baud_rate_is_said_and_the_right_one_heard(ground, tmp_pat
         await line.send(garbage, service)
         notice = await told(ground, "no MAVLink")
         assert notice == "array: what comes is no MAVLink: wrong baud rate?"
-        assert service.pipeline.assembler.counts["epochs"] == 0
+        assert service.account().assembly["epochs"] == 0
         for burst in sent:
             await line.send(burst, service)
             await ground.next("ATTITUDE_QUATERNION")
         await told(ground, "MAVLink comes")
-    assert service.pipeline.assembler.counts["epochs"] == EPOCHS
+    assert service.account().assembly["epochs"] == EPOCHS
 
 
 async def test_half_a_frame_for_ever_costs_no_memory_and_not_the_frame_behind_it(
@@ -131,7 +131,7 @@ async def test_half_a_frame_for_ever_costs_no_memory_and_not_the_frame_behind_it
         for epoch in epochs:
             await line.send(epoch, service)
             await ground.next("ATTITUDE_QUATERNION")
-    assert service.pipeline.assembler.counts["samples_lost"] == 0
+    assert service.account().assembly["samples_lost"] == 0
     assert service.dropped
 
 
@@ -167,7 +167,7 @@ async def test_a_flood_from_strangers_costs_no_memory_and_the_array_no_epoch(gro
         assert len(service._parsers) <= MOST_PEERS
     tracemalloc.stop()
     assert memory[1] - memory[0] < 100_000
-    counts = service.pipeline.assembler.counts
+    counts = service.account().assembly
     assert (counts["epochs"], counts["samples_lost"]) == (EPOCHS, 0)
     assert service.links[0].counts.dropped_in > 0
 
@@ -207,7 +207,7 @@ async def test_what_came_while_the_loop_stood_still_is_used_afterwards(ground, c
     decoder = public.MAVLink(None)
     stamps = [decoder.parse_buffer(frame.raw)[0].time_boot_ms for frame in heard]
     assert stamps == [1000 + 10 * k for k in range(EPOCHS)]
-    assert service.pipeline.assembler.counts["samples_lost"] == 0
+    assert service.account().assembly["samples_lost"] == 0
 
 
 async def test_a_disk_that_is_read_only_costs_recordings_and_memory_and_nothing_else(

@@ -295,6 +295,21 @@ def test_a_frame_comes_with_its_last_byte(mix):
         assert [found.raw for found in last] == [frame]
 
 
+@pytest.mark.parametrize("mix", KNOWN_MIXES)
+def test_it_is_known_whether_a_frame_has_ended(mix):
+    parser, (first, second) = FrameParser(), sequence(mix, 31, 2)
+    assert parser.is_between_frames
+    for byte in first[:-1]:
+        parser.receive_data(bytes([byte]))
+        assert not parser.is_between_frames
+    parser.receive_data(first[-1:])
+    assert parser.is_between_frames
+    parser.receive_data(b"\0")
+    assert not parser.is_between_frames
+    parser.receive_data(second)
+    assert parser.is_between_frames
+
+
 @pytest.mark.parametrize("size", [1, 100, 65536])
 @pytest.mark.parametrize(
     "pattern",

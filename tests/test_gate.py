@@ -132,7 +132,7 @@ async def test_strangers_who_flood_the_arrays_port_cost_no_epoch_and_little_memo
                 heard += await feed(ground, service, [burst])
             array = service.links[0]
             assert len(heard) == EPOCHS
-            assert service.pipeline.assembler.counts["samples_lost"] == 0
+            assert service.account().assembly["samples_lost"] == 0
             assert array.counts.dropped_in > 50 * EPOCHS
             assert len(array.peers) <= udp.MOST_PEERS // 2
             assert len(service._parsers) <= MOST_PARSERS

@@ -34,6 +34,7 @@ class Watched:
 
     def give(self, data: bytes, peer: str = "") -> None:
         self.service._receive(self.service.links[0], data, peer)
+        self.service._take_account()
 
 
 class Singly:

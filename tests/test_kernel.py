@@ -8,7 +8,10 @@ from filters import DEFAULTS, fused
 from msgspec import structs
 
 from risaf_link.core import aiding, eskf, kernel
+from risaf_link.core.attitude import AttitudeParameters
 from risaf_link.core.earth import GRAVITY
+from risaf_link.core.estimator import Estimator
+from risaf_link.core.fusion import FusionParameters
 from risaf_link.core.heading import HeadingParameters
 from risaf_link.core.rotation import wrap
 
@@ -77,3 +80,37 @@ def test_the_kernel_s_filter_is_that_of_the_python_form(seed):
     deviation = np.sqrt(filters[0].covariance.diagonal())
     difference = (filters[0].covariance - filters[1].covariance) / np.outer(deviation, deviation)
     assert np.abs(difference).max() < 1e-11
+
+
+@pytest.mark.parametrize("method", ["mean", "median", "risaf", "robust"])
+@pytest.mark.parametrize("accelerometers", [0, 4])
+def test_epochs_gone_ahead_of_are_those_of_a_block(method, accelerometers):
+    generator = np.random.default_rng(1)
+    parameters = FusionParameters(method=method), AttitudeParameters(), HeadingParameters()
+    ahead, usual = Estimator(*parameters), Estimator(*parameters)
+    for epochs in (7, 1, 30):
+        dt = np.full(epochs, 0.01)
+        rates_b = generator.normal(0.0, 0.1, (epochs, 5, 3))
+        forces_b = generator.normal(0.0, 9.0, (epochs, accelerometers, 3))
+        rows = [
+            ahead.go_ahead(0.01, rates.tobytes() + forces.tobytes(), 5)
+            for rates, forces in zip(rates_b, forces_b, strict=True)
+        ]
+        tracks = [each.advance(dt, rates_b, forces_b) for each in (ahead, usual)]
+        assert b"".join(rows) == tracks[1][0].values.tobytes()
+        assert tracks[0][0].values.tobytes() == tracks[1][0].values.tobytes()
+        assert tracks[0][1].tolist() == tracks[1][1].tolist()
+
+
+def test_a_block_that_is_not_what_was_gone_ahead_of_is_refused():
+    estimator = Estimator(FusionParameters(), AttitudeParameters(), HeadingParameters())
+    estimator.go_ahead(0.01, bytes(24 * 3), 3)
+    with pytest.raises(ValueError, match="dt: found 2 epochs, expected the 1 ahead"):
+        estimator.advance(np.full(2, 0.01), np.zeros((2, 3, 3)), np.zeros((2, 0, 3)))
+
+
+@pytest.mark.parametrize("size", [24 * 2, 24 * 3 + 8])
+def test_readings_that_are_too_few_or_broken_are_refused(size):
+    estimator = Estimator(FusionParameters(), AttitudeParameters(), HeadingParameters())
+    with pytest.raises(ValueError, match="readings: "):
+        estimator.go_ahead(0.01, bytes(size), 3)

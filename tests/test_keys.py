@@ -259,7 +259,7 @@ async def test_a_signed_array_is_taken_whole_and_an_unsigned_one_not_at_all(grou
         signed_bursts = [[resigned(raw, sender) for raw in burst] for burst in bursts()]
         assert len(await feed(ground, service, signed_bursts)) == EPOCHS
         assert service.rejected == {"array: unsigned": sum(map(len, unsigned))}
-        assert service.pipeline.assembler.counts["epochs"] == EPOCHS
+        assert service.account().assembly["epochs"] == EPOCHS
 
 
 def resigned(raw: bytes, sender: LinkSigning) -> bytes:

@@ -16,7 +16,7 @@ LAYERS = [
     {"config", "sweep"},
     {"kept"},
     {"keys", "remembered", "supervisor", "install", "gibberish"},
-    {"gate"},
+    {"gate", "prompt"},
     {"service", "replay", "survey", "calibrate", "experiments", "monitor"},
     {"fleet", "words", "bench", "demo"},
     {"judgement"},

@@ -52,7 +52,7 @@ async def test_a_recording_replays_to_the_same_outputs_bit_for_bit(ground, tmp_p
         ground.transport.sendto(half, address_of(service))
         await until(lambda: service.links[0].counts.bytes_in == whole + len(half))
     await ground.next("ATTITUDE_QUATERNION")
-    assert service.pipeline.assembler.counts["epochs"] == EPOCHS + 1
+    assert service.account().assembly["epochs"] == EPOCHS + 1
     live = outputs(ground.heard)
     assert len(live) > EPOCHS
     assert replayed(config, recording) == live
@@ -161,7 +161,7 @@ async def test_garbage_from_one_peer_costs_another_nothing(ground):
             for k, burst in enumerate(sent):
                 stranger.sendto(bytes([0xFD, 200, k % 256]) * 20, address_of(service))
                 await feed(ground, service, [burst])
-        counts = service.pipeline.assembler.counts
+        counts = service.account().assembly
         assert (counts["epochs"], counts["incomplete"]) == (EPOCHS, 0)
         assert service.dropped
 
@@ -194,7 +194,7 @@ async def test_a_serial_array_that_is_unplugged_comes_back_while_other_links_go_
                 os.write(master, b"".join([*info, *burst]))
                 await ground.next("ATTITUDE_QUATERNION")
             os.close(master)
-        assert service.pipeline.assembler.counts["epochs"] == EPOCHS
+        assert service.account().assembly["epochs"] == EPOCHS
         assert other.counts.connections == 1
 
 

@@ -146,6 +146,15 @@ def advance(
     forces_b: Floats,
     known: Floats,
 ) -> None: ...
+def advance_one(
+    gyros: _Fusion,
+    accelerometers: Robust,
+    attitude: Eskf,
+    aiding: Aiding,
+    dt: float,
+    readings: bytes,
+    n: int,
+) -> bytes: ...
 
 class Cutter:
     summed: int
@@ -187,3 +196,11 @@ class EpochFinder:
         | None
     ): ...
     def single(self) -> int: ...
+    def only(
+        self,
+        cutter: Cutter,
+        frames: bytes,
+        array: ArrayLayout,
+        time_us: int,
+        sequence: int,
+    ) -> tuple[int, float, bytes] | None: ...

@@ -20,7 +20,7 @@ from risaf_link.core.guard import HeadingGuard
 from risaf_link.core.heading import HeadingParameters, Motion
 from risaf_link.core.memory import ArrayMemory, FilterMemory
 from risaf_link.core.rotation import Floats
-from risaf_link.core.track import RESETS, Track
+from risaf_link.core.track import COLUMNS, RESETS, Track
 
 FUSIONS: dict[str, Callable[[FusionParameters], Fusion]] = {
     "robust": kernel.Robust,
@@ -56,6 +56,7 @@ class Estimator:
         self.elapsed = 0.0
         self._parameters = fusion, attitude, heading
         self._resets = 0  # of yaw, by the filters before this one
+        self._ahead: list[bytes] = []  # rows of epochs that `advance` will be given
         self._begin()
 
     @property
@@ -156,6 +157,30 @@ class Estimator:
                 self._filter.predict(fused, dt)
             self._guard.note_hearsay()
 
+    def go_ahead(self, dt: float, readings: bytes, n: int) -> bytes | None:
+        """Carry fusion and filter on over one epoch, of which `advance` takes account later.
+
+        Nothing else may be asked for until `advance` has been given all such epochs at once.
+
+        Parameters
+        ----------
+        dt : float
+            Seconds since the epoch before.
+        readings : bytes
+            Of n gyros, and behind them of the accelerometers: those of `advance`, as doubles.
+
+        Returns
+        -------
+        bytes or None
+            The epoch's row of the track. None: fusion or filter are not the kernel's, and nothing
+            has been done.
+        """
+        parts = self.fusion, self._force_fusion, self._filter, self._aiding
+        row = kernel.advance_one(*parts, dt, readings, n)
+        if row is not None:
+            self._ahead.append(row)
+        return row
+
     def advance(self, dt: Floats, rates_b: Floats, forces_b: Floats) -> tuple[Track, Floats]:
         """Carry the estimate on over k epochs, at least one.
 
@@ -173,7 +198,14 @@ class Estimator:
             Time of each epoch, s.
         """
         parts = self.fusion, self._force_fusion, self._filter, self._aiding
-        values = kernel.advance(*parts, dt, rates_b, forces_b)
+        values: Floats | None
+        if self._ahead:
+            values = np.frombuffer(bytearray().join(self._ahead)).reshape(-1, COLUMNS)
+            self._ahead.clear()
+            if len(values) != len(dt):
+                raise ValueError(f"dt: found {len(dt)} epochs, expected the {len(values)} ahead")
+        else:
+            values = kernel.advance(*parts, dt, rates_b, forces_b)
         if values is None:
             epochs = zip(dt.tolist(), rates_b, forces_b, strict=True)
             track = Track.of([step(*parts, Epoch(0, *epoch, 0)) for epoch in epochs])

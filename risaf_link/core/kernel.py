@@ -297,18 +297,43 @@ def advance(
 
     Parameters are those of `Estimator.advance`; the result is the values of a `Track`.
     """
-    if not (
+    parts = _kernels(gyros, accelerometers, attitude, aid)
+    if parts is None:
+        return None
+    known: Floats = np.empty((len(dt), COLUMNS))
+    native.advance(*parts, dt, rates_b, forces_b, known)
+    return known
+
+
+def advance_one(
+    gyros: Fusion,
+    accelerometers: object,
+    attitude: object,
+    aid: object,
+    dt: float,
+    readings: bytes,
+    n: int,
+) -> bytes | None:
+    """Carry all of them on over one epoch, as `advance` does.
+
+    Parameters are those of `Estimator.go_ahead`; the result is the bytes of a row of a `Track`.
+    """
+    parts = _kernels(gyros, accelerometers, attitude, aid)
+    return None if parts is None else native.advance_one(*parts, dt, readings, n)
+
+
+def _kernels(
+    gyros: Fusion, accelerometers: object, attitude: object, aid: object
+) -> "tuple[Any, native.Robust, native.Eskf, native.Aiding] | None":
+    if (
         BUILT
         and isinstance(gyros, _Fusion)
         and isinstance(accelerometers, _Robust)
         and isinstance(attitude, _Eskf)
         and isinstance(aid, _Aiding)
     ):
-        return None
-    known: Floats = np.empty((len(dt), COLUMNS))
-    parts = gyros.kernel, accelerometers.kernel, attitude.kernel, aid.kernel
-    native.advance(*parts, dt, rates_b, forces_b, known)
-    return known
+        return gyros.kernel, accelerometers.kernel, attitude.kernel, aid.kernel
+    return None
 
 
 def _told_risaf(p: FusionParameters) -> tuple[float, ...]:
@@ -347,4 +372,5 @@ __all__ = [
     "Robust",
     "SpeedTracker",
     "advance",
+    "advance_one",
 ]

@@ -1,5 +1,6 @@
 """What is estimated at each of a run of epochs, as columns."""
 
+import struct
 from collections.abc import Iterable
 
 import numpy as np
@@ -18,6 +19,9 @@ ACTIVE, VALID, AHEAD = slice(27, 30), 30, 31
 COMMON, BIAS_STD = slice(32, 35), slice(35, 38)
 COLUMNS = 38
 YAW_STD = 12
+
+attitude_and_rate = struct.Struct("7d").unpack_from
+"""What stands in Q_NB and RATE of the bytes of one row."""
 
 
 class Track(Struct, frozen=True):

@@ -32,7 +32,7 @@ from risaf_link.mavlink.epoch import (
     RegularEpochs,
     Source,
 )
-from risaf_link.mavlink.frame import Frame, FrameTable
+from risaf_link.mavlink.frame import Frame, FrameTable, cutter
 from risaf_link.mavlink.gps import READERS
 from risaf_link.mavlink.identity import NO_AUTOPILOT, autopilot_in
 from risaf_link.mavlink.ingest import NONE, ArrayInfo, Ingest
@@ -63,19 +63,12 @@ class BlockReader:
         Of the pipeline: blocks are taken here, what comes alone is taken there.
     apart : collection of int
         Ids of messages that are not the pipeline's, and are to be handed on in their place as well.
-    longest : int
-        Epochs of a block, at most.
     """
 
     def __init__(
-        self,
-        ingest: Ingest,
-        assembler: EpochAssembler,
-        apart: Collection[int] = (),
-        longest: int = REVIEW,
+        self, ingest: Ingest, assembler: EpochAssembler, apart: Collection[int] = ()
     ) -> None:
         self._ingest, self._assembler = ingest, assembler
-        self._longest = longest
         self._kinds = _kinds(ingest, apart)
         self._layout: native.ArrayLayout
         self._laid_out: tuple[Source, ArrayInfo, int, int] | None = None  # what for
@@ -87,7 +80,7 @@ class BlockReader:
             )
 
     def read(
-        self, table: FrameTable, times_us: Stamps | int
+        self, table: FrameTable, times_us: Stamps | int, longest: int = REVIEW
     ) -> Iterator[EpochBlock | tuple[Frame, int]]:
         """Read the next frames of a log.
 
@@ -96,6 +89,8 @@ class BlockReader:
         table : FrameTable
         times_us : ndarray of uint64, or int
             When each frame was received, or all of them.
+        longest : int
+            Epochs of a block, at most.
 
         Yields
         ------
@@ -109,7 +104,7 @@ class BlockReader:
             return
         self._finder.load(table.buffer, table.records, times_us)
         while True:
-            most = min(self._assembler.until_review, self._longest)
+            most = min(self._assembler.until_review, longest)
             block = self._block(table, most)
             if block is not None:
                 done, idle = 0, list[tuple[Frame, int]]()
@@ -142,11 +137,31 @@ class BlockReader:
         if self._steady is None:
             self._steady = False
             source = self._assembler.source
-            if source is not None and source == self._ingest.source:
+            if self._finder is not None and source is not None and source == self._ingest.source:
                 info = self._ingest.info_of_counts(source)
                 self._steady = self._assembler.is_steady(info.sensors)
                 self._lay_out(source, info)
         return self._steady
+
+    def next(self, frames: bytes, time_us: int, sequence: int) -> tuple[int, float, bytes] | None:
+        """Read the next epoch alone, without taking it.
+
+        Parameters
+        ----------
+        frames : bytes
+        time_us, sequence : int
+            Of the epoch before.
+
+        Returns
+        -------
+        tuple or None
+            Its time, us, seconds since the one before, and its readings: rates and behind them
+            forces, as doubles. None: it is not the next one, or not whole, or there is something
+            else.
+        """
+        if self._finder is None or cutter is None or not self.is_steady:
+            return None
+        return self._finder.only(cutter, frames, self._layout, time_us, sequence)
 
     def _block(self, table: FrameTable, most: int) -> RegularEpochs | None:
         last = self._assembler.last

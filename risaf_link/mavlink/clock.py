@@ -65,6 +65,7 @@ class VehicleClock:
         self._component = component
         self._delay_us = 0
         self._unread: list[_Stamps] = []
+        self._ahead_us: list[int] = []  # stamps of epochs that `stamps` will be given
         self._autopilot: tuple[int, int] | None = None
         self._vehicle, self._array = Lead(), Lead()
         self._other: Lead | None = None  # the array's, of epochs that are out of the way
@@ -119,10 +120,19 @@ class VehicleClock:
         as much.
         """
         stamps = _Stamps(time_us, received_us, self._catch_up)
+        if self._ahead_us:
+            stamps.boot_us, self._ahead_us = np.array(self._ahead_us), []
+            return stamps
         self._unread.append(stamps)
         if len(self._unread) >= MOST_UNREAD:
             self._catch_up()
         return stamps
+
+    def stamp(self, time_us: int, received_us: int) -> int:
+        """Do what `boot_us` does for an epoch that `stamps` is given later, with all such ones."""
+        self._catch_up()
+        self._ahead_us.append(self.boot_us(time_us, received_us))
+        return self._ahead_us[-1]
 
     def _catch_up(self) -> None:
         """Take the epochs that nobody has asked for yet."""

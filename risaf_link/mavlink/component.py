@@ -28,7 +28,7 @@ from risaf_link.mavlink.pulse import Pulse
 from risaf_link.mavlink.requests import Requests
 from risaf_link.mavlink.signing import KEY_SIZE, SETUP_SIGNING, setup_in
 from risaf_link.mavlink.storage import NO_PLACE, Storage
-from risaf_link.mavlink.telemetry import heartbeat
+from risaf_link.mavlink.telemetry import Emitter, heartbeat
 from risaf_link.mavlink.tuning import Answer, Tuning
 
 CAPABILITIES = 8 | 16 | 8192
@@ -123,6 +123,7 @@ class Component:
         self._listen = listen
         self._outbox: list[tuple[Peer | None, str, dict[str, Any]]] = []  # None: to all
         self._estimate: Estimate | None = None
+        self._ahead = 0  # estimates that `observe` will be given
         self._received_us = 0
         self._calibration = GyroCalibration(estimator.set_bias)
         self._pulse = Pulse()
@@ -174,10 +175,18 @@ class Component:
         """Take note of all that a peer sent, also of what is not handed to `receive`."""
         self._requests.note_traffic(table, peer)
 
+    def note_ahead(self) -> None:
+        """Take note that there is an estimate, which `observe` is given later."""
+        self._ahead += 1
+        self._pulse.note_epoch()
+
     def observe(self, estimate: Estimate) -> None:
         """Take the next estimate."""
         self._estimate = estimate
-        self._pulse.note_epoch()
+        if self._ahead:
+            self._ahead -= 1
+        else:
+            self._pulse.note_epoch()
         self._notices.observe(estimate)
         if self._calibration.is_running:
             self._report(self._calibration.observe(estimate))
@@ -274,6 +283,10 @@ class Component:
     def emit(self, estimate: Estimate, peers: Iterable[Peer]) -> list[tuple[Peer, bytes]]:
         """Take the frames that are due to each peer at an estimate."""
         return [(peer, raw) for peer in peers for raw in self._peers.emitter(peer).emit(estimate)]
+
+    def emitters(self, peers: Iterable[Peer]) -> list[Emitter]:
+        """What makes the frames of each peer."""
+        return [self._peers.emitter(peer) for peer in peers]
 
     def _post(self, answer: Answer, peer: Peer) -> None:
         """Send an answer; to the one who asked, also where a link is silent else."""

@@ -89,6 +89,32 @@ def reader(name: str, *fields: str) -> Callable[[bytes], tuple[Any, ...]]:
     return read
 
 
+def writer(name: str, *fields: str) -> Callable[..., tuple[int, bytes]]:
+    """Make a function that does what `pack` does from values of some fields, quicker.
+
+    Parameters
+    ----------
+    name : str
+        The message.
+    *fields : str
+        The first of its fields as they are laid out, none of them an array; all others are zero.
+
+    Returns
+    -------
+    callable
+        From the values of `fields`, in that order, to id and payload.
+    """
+    message_id, _, ordered, _, packer = _layout(name)
+    if fields != tuple(ordered[: len(fields)]):
+        raise ValueError(f"{name}: fields {fields}, expected the first of {ordered}")
+    zeros = packer.unpack(bytes(packer.size))[len(fields) :]
+
+    def write(*values: float) -> tuple[int, bytes]:
+        return message_id, packer.pack(*values, *zeros)
+
+    return write
+
+
 def text_of(field: bytes) -> str:
     """Text of a field, which ends at the first NUL."""
     return field.partition(b"\0")[0].decode(errors="replace")

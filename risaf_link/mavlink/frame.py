@@ -28,7 +28,8 @@ from risaf_link.mavlink.search import (
 
 _HEADER = struct.Struct("<BBBBBBBHB")
 
-cut = native.Cutter(CRC_EXTRA).cut if native else search.cut
+cutter = native.Cutter(CRC_EXTRA) if native else None
+cut = cutter.cut if cutter else search.cut
 
 
 class Frame(Struct, frozen=True):  # a frozen dataclass takes as long to make as all the rest
@@ -121,6 +122,11 @@ class FrameParser:
         self._buffer = b""
         self._done = 0  # where the last frame ended
         self._in_step = True  # a frame must start behind the last one and a prefix
+
+    @property
+    def is_between_frames(self) -> bool:
+        """Whether a frame has ended with the last byte, so that the next one may follow."""
+        return self._in_step and self._done == len(self._buffer)
 
     def receive_data(self, data: bytes) -> list[Frame]:
         """Take the next bytes of the stream.

@@ -37,6 +37,16 @@ class Held:
         self._parts.append(data)
         return True
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether the present datagram, which is not held, is the one that came last before."""
+        return bool(self._last) and self._present == self._last
+
+    @property
+    def parts(self) -> list[bytes]:
+        """What waits."""
+        return self._parts
+
     def take(self, data: bytes = b"") -> bytes:
         """Give all that waits, and what came after it."""
         if not self._parts:

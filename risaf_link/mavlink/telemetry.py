@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from risaf_link.core.estimate import Estimate
 from risaf_link.core.heading import HeadingSource, HeadingState
 from risaf_link.core.health import ArrayHealth, SensorState
-from risaf_link.mavlink.dialect import pack
+from risaf_link.mavlink.dialect import pack, writer
 from risaf_link.mavlink.frame import encode
 from risaf_link.mavlink.identity import NO_AUTOPILOT
 from risaf_link.mavlink.odometry import Profile, odometry
@@ -29,6 +29,8 @@ Message = Literal[
     "NAMED_VALUE_FLOAT",
     "ODOMETRY",
 ]
+
+ATTITUDE: Message = "ATTITUDE_QUATERNION"
 
 Rates = dict[Message, Annotated[float, Meta(gt=0, le=10_000)]]
 """Hz; what is not named is not sent."""
@@ -49,6 +51,12 @@ MAVLINK_VERSION = 3
 MOST_ASKED = 2000.0  # Hz, of all messages that one peer asks for
 ESTIMATOR_ATTITUDE, ESTIMATOR_GPS_GLITCH = 1, 1024  # ESTIMATOR_STATUS_FLAGS
 UINT32_LIMIT = 2**32 - 1
+ROUNDED_US = 1000  # more than the end of a period can be off by
+
+_ATTITUDE = writer(
+    *("ATTITUDE_QUATERNION", "time_boot_ms", "q1", "q2", "q3", "q4"),
+    *("rollspeed", "pitchspeed", "yawspeed"),
+)
 
 
 class ComponentState(IntEnum):
@@ -94,9 +102,9 @@ class Emitter:
         self.system = system
         self.profile = profile
         self._signing = signing
-        self._rates = rates
         self._asked: dict[Message, float] = {}  # Hz, 0: none
-        self._sent = rates  # what is sent in fact
+        self._rates = self._sent = rates
+        self.set_defaults(rates)
         self._component = component
         self._sequence = 0
         self._next_part: dict[str, int] = {}  # of messages that tell of some at a time
@@ -110,7 +118,8 @@ class Emitter:
     def set_defaults(self, rates: Rates) -> None:
         """Change what is sent of messages that the peer has not asked for."""
         self._rates = rates
-        self._sent = {m: rate for m, rate in {**rates, **self._asked}.items() if rate > 0}
+        asked = {ATTITUDE: 0.0, **rates, **self._asked}  # it goes first, for it is answered first
+        self._sent = {name: rate for name, rate in asked.items() if rate > 0}
 
     def ask(self, name: Message, rate: float | None) -> bool:
         """Let the peer have a message at so many Hz; 0: not at all, None: by default.
@@ -130,12 +139,32 @@ class Emitter:
         """Frames due at an estimate."""
         frames = []
         for name, rate in self._sent.items():
-            period = math.floor(estimate.time_us * rate / 1e6)
-            if period != self._periods.get(name):
-                self._periods[name] = period
-                if self.can_tell(name, estimate):
-                    frames.append(self.tell(name, estimate))
+            if self._is_due(name, rate, estimate.time_us) and self.can_tell(name, estimate):
+                frames.append(self.tell(name, estimate))
         return frames
+
+    @property
+    def until_us(self) -> float:
+        """Before which time of an epoch nothing is due but its attitude; epochs go on in time."""
+        others = [(name, rate) for name, rate in self._sent.items() if name != ATTITUDE]
+        return min(
+            ((self._periods.get(name, -1) + 1) * 1e6 / rate - ROUNDED_US for name, rate in others),
+            default=math.inf,
+        )
+
+    def emit_attitude(self, time_us: int, boot_us: int, *attitude: float) -> list[bytes]:
+        """Do what `emit` does with an attitude: its quaternion and rate, rad/s."""
+        rate = self._sent.get(ATTITUDE)
+        if rate is None or not self._is_due(ATTITUDE, rate, time_us):
+            return []
+        return [self._frame(*_ATTITUDE(_boot_ms(boot_us), *attitude))]
+
+    def _is_due(self, name: Message, rate: float, time_us: int) -> bool:
+        """Whether a message is due at an epoch; if so, it is taken for sent."""
+        period = math.floor(time_us * rate / 1e6)
+        is_due = period != self._periods.get(name)
+        self._periods[name] = period
+        return is_due
 
     def can_tell(self, name: Message, estimate: Estimate) -> bool:
         """Whether there is anything to tell: to an autopilot nothing before the heading is set."""
@@ -174,8 +203,12 @@ class Emitter:
 
     def frame(self, name: str, /, **fields: Any) -> bytes:
         """Any message, from us."""
+        return self._frame(*pack(name, **fields))
+
+    def _frame(self, message_id: int, payload: bytes) -> bytes:
         sign = self._signing.sign if self._signing else None
-        frame = encode(*pack(name, **fields), self._sequence, self.system, self._component, sign)
+        ours = self._sequence, self.system, self._component
+        frame = encode(message_id, payload, *ours, sign)
         self._sequence = (self._sequence + 1) % 256
         return frame
 
@@ -192,12 +225,16 @@ def heartbeat(state: ComponentState) -> dict[str, Any]:
     }
 
 
+def _boot_ms(boot_us: int) -> int:
+    return boot_us // 1000 % 2**32
+
+
 def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
     attitude = estimate.attitude
     w, x, y, z = attitude.q_nb.tolist()
     roll, pitch, yaw = attitude.rate_b.tolist()
     return {
-        "time_boot_ms": estimate.boot_us // 1000 % 2**32,
+        "time_boot_ms": _boot_ms(estimate.boot_us),
         "q1": w,
         "q2": x,
         "q3": y,
@@ -236,7 +273,7 @@ def _estimator_status(estimate: Estimate) -> dict[str, Any]:
 def _named_value_float(estimate: Estimate, turn: int) -> dict[str, Any]:
     name, value = _NAMED[turn]
     return {
-        "time_boot_ms": estimate.boot_us // 1000 % 2**32,
+        "time_boot_ms": _boot_ms(estimate.boot_us),
         "name": name,
         "value": value(estimate),
     }

@@ -150,10 +150,28 @@ void advance(Fusion& gyros, risaf::Robust& accelerometers, Eskf& filter, Aiding&
                  reinterpret_cast<risaf::Known*>(known.data()));
 }
 
+// One epoch of n gyros. To take readings out of bytes, and give a row of a track so, costs less than
+// arrays do.
+template <typename Fusion>
+nb::bytes advance_one(Fusion& gyros, risaf::Robust& accelerometers, Eskf& filter, Aiding& aiding,
+                      double dt, const nb::bytes& readings, std::size_t n) {
+  const std::size_t sensors = readings.size() / (3 * sizeof(double));
+  if (sensors < n || readings.size() % (3 * sizeof(double)) != 0) {
+    throw nb::value_error("readings: found fewer than of all gyros, or a part of one");
+  }
+  const auto* rates_b = static_cast<const double*>(readings.data());
+  nb::bytes row(nullptr, sizeof(risaf::Known));
+  risaf::advance(gyros, accelerometers, filter, aiding, 1, &dt, rates_b, n, rates_b + 3 * n,
+                 sensors - n, static_cast<risaf::Known*>(const_cast<void*>(row.data())));
+  return row;
+}
+
 template <typename Fusion>
 void bind_advance(nb::module_& m) {
   m.def("advance", &advance<Fusion>, "gyros"_a, "accelerometers"_a, "attitude"_a, "aiding"_a, "dt"_a,
         "rates_b"_a, "forces_b"_a, "known"_a.noconvert());
+  m.def("advance_one", &advance_one<Fusion>, "gyros"_a, "accelerometers"_a, "attitude"_a, "aiding"_a,
+        "dt"_a, "readings"_a, "n"_a);
 }
 
 }  // namespace

@@ -48,6 +48,15 @@ class Cutter {
         follows, search.skipped, nb::make_tuple(dropped[0], dropped[1], dropped[2], dropped[3]));
   }
 
+  // The frames of which bytes consist; none if there is anything else in them.
+  std::vector<risaf::Cut> frames(const nb::bytes& bytes) const {
+    risaf::Search search(extras_, data(bytes), bytes.size(), 0, false);
+    const auto [rest, follows] = search.cut(0, true);
+    const bool is_all = follows && search.keep + rest == bytes.size() && search.skipped == 0 &&
+                        search.dropped == decltype(search.dropped){};
+    return is_all ? std::move(search.cuts) : std::vector<risaf::Cut>{};
+  }
+
  private:
   static constexpr std::size_t LONG = 1 << 16;  // bytes; with fewer others can wait
 
@@ -116,6 +125,29 @@ class EpochFinder {
 
   std::size_t single() { return finder_.single(); }
 
+  // The array's next epoch, if frames bring that and nothing else: its time, dt, and the readings of
+  // gyros and accelerometers, double. None: they do not. The table is given up.
+  nb::object only(const Cutter& cutter, const nb::bytes& frames, const risaf::ArrayLayout& array,
+                  std::int64_t time_us, std::uint16_t sequence) {
+    const auto cuts = cutter.frames(frames);
+    times_us_.assign(cuts.size(), 0);
+    finder_.load(data(frames), cuts.data(), times_us_.data(), cuts.size());
+    risaf::Clock clock{time_us, sequence};
+    const auto& epochs = finder_.take(array, &clock, 0, 1);
+    nb::object found = nb::none();
+    if (epochs.size() == 1 && finder_.chunks() == cuts.size()) {
+      const std::size_t rates = 3 * array.gyros.count, forces = 3 * array.accels.count;
+      nb::bytes readings(nullptr, sizeof(double) * (rates + forces));
+      auto* values = static_cast<double*>(const_cast<void*>(readings.data()));
+      finder_.read(array.gyros, true, values);
+      finder_.read(array.accels, false, values + rates);
+      const std::int64_t now_us = epochs[0].time_us;
+      found = nb::make_tuple(now_us, static_cast<double>(now_us - time_us) / 1e6, readings);
+    }
+    finder_.load(nullptr, nullptr, nullptr, 0);
+    return found;
+  }
+
  private:
   void load_timed(nb::bytes buffer, nb::bytes records) {
     finder_.load(data(buffer), reinterpret_cast<const risaf::Cut*>(data(records)), times_us_.data(),
@@ -155,5 +187,7 @@ void bind_frames(nb::module_& m) {
       .def("load", &EpochFinder::load_at_once, "buffer"_a, "records"_a, "time_us"_a)
       .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a,
            "heard_us"_a, "most"_a)
-      .def("single", &EpochFinder::single);
+      .def("single", &EpochFinder::single)
+      .def("only", &EpochFinder::only, "cutter"_a, "frames"_a, "array"_a, "time_us"_a,
+           "sequence"_a);
 }

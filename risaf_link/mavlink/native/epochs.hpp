@@ -152,6 +152,9 @@ class EpochFinder {
   // What stood between the epochs that were taken and is not listened to.
   const std::vector<std::size_t>& refused() const { return refused_; }
 
+  // How many frames of readings are in the epochs that were taken.
+  std::size_t chunks() const { return chunks_.size(); }
+
   // Readings of the epochs that were taken, (epochs, sensors, 3).
   Unusable read(const Sensors& sensors, bool is_gyro, double* values) const {
     Unusable unusable;
