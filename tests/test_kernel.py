@@ -105,7 +105,7 @@ def test_epochs_gone_ahead_of_are_those_of_a_block(method, accelerometers):
 def test_a_block_that_is_not_what_was_gone_ahead_of_is_refused():
     estimator = Estimator(FusionParameters(), AttitudeParameters(), HeadingParameters())
     estimator.go_ahead(0.01, bytes(24 * 3), 3)
-    with pytest.raises(ValueError, match="dt: found 2 epochs, expected the 1 ahead"):
+    with pytest.raises(ValueError, match="dt: found 2 epochs, expected the 1 gone ahead of"):
         estimator.advance(np.full(2, 0.01), np.zeros((2, 3, 3)), np.zeros((2, 0, 3)))
 
 

@@ -196,7 +196,7 @@ class EpochFinder:
         | None
     ): ...
     def single(self) -> int: ...
-    def only(
+    def next(
         self,
         cutter: Cutter,
         frames: bytes,

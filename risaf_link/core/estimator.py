@@ -198,12 +198,8 @@ class Estimator:
             Time of each epoch, s.
         """
         parts = self.fusion, self._force_fusion, self._filter, self._aiding
-        values: Floats | None
         if self._ahead:
-            values = np.frombuffer(bytearray().join(self._ahead)).reshape(-1, COLUMNS)
-            self._ahead.clear()
-            if len(values) != len(dt):
-                raise ValueError(f"dt: found {len(dt)} epochs, expected the {len(values)} ahead")
+            values: Floats | None = self._take_ahead(len(dt))
         else:
             values = kernel.advance(*parts, dt, rates_b, forces_b)
         if values is None:
@@ -220,6 +216,14 @@ class Estimator:
         self.elapsed = float(elapsed[-1])
         self._guard.advance(track, elapsed, dt)
         return track, elapsed
+
+    def _take_ahead(self, epochs: int) -> Floats:
+        """Rows of the track that is known already."""
+        rows: Floats = np.frombuffer(bytearray().join(self._ahead)).reshape(-1, COLUMNS)
+        self._ahead.clear()
+        if len(rows) != epochs:
+            raise ValueError(f"dt: found {epochs} epochs, expected the {len(rows)} gone ahead of")
+        return rows
 
     def correct(self, motion: Motion, latitude: float) -> Innovation | None:
         """Use what a fix says; None: it says nothing of heading.

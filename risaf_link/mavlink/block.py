@@ -161,7 +161,7 @@ class BlockReader:
         """
         if self._finder is None or cutter is None or not self.is_steady:
             return None
-        return self._finder.only(cutter, frames, self._layout, time_us, sequence)
+        return self._finder.next(cutter, frames, self._layout, time_us, sequence)
 
     def _block(self, table: FrameTable, most: int) -> RegularEpochs | None:
         last = self._assembler.last

@@ -172,10 +172,12 @@ def service(data: bytes) -> None:
         outputs["mqtt"] = MqttParameters("mqtt://nobody", rates=MqttRates(50, 50, 50, 50))
         outputs["metrics"] = MetricsParameters("127.0.0.1:1")
     config = structs.replace(base, emit=dict.fromkeys(EMITTED.values(), 8.0), **outputs)
-    running, all_sent = Deaf(config), list(messages(data[1:]))
-    for sent in all_sent:
-        running.receive(sent)
-    running.end()
+    all_sent = list(messages(data[1:]))
+    running = Deaf(config).given(all_sent)
+    if not outputs:
+        usual = Deaf(config, prompt=False).given(all_sent)
+        assert sorted(usual.sent, key=_peer) == sorted(running.sent, key=_peer)
+        assert usual.account() == running.account()
     _check_replay(config, running.recorded, running.tracks)
     last: dict[Any, int] = {}
     for (peer, raw), message in zip(
@@ -193,8 +195,10 @@ def service(data: bytes) -> None:
 class Deaf(Service):
     """The service, whose links are handed frames and whose own frames are kept."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, prompt: bool = True) -> None:
         super().__init__(config, clock_us=lambda: self.now_us)
+        if not prompt:
+            self._prompt.answer = lambda *_: None  # type: ignore[method-assign]
         self.now_us = START_US
         self.steady_us = 0  # a clock that does not jump
         self.sent: list[tuple[Any, bytes]] = []
@@ -219,6 +223,13 @@ class Deaf(Service):
             self.tracks.append(block.track.values.tobytes())
         super()._send(blocks, told)
 
+    def given(self, all_sent: list[Sent]) -> "Deaf":
+        """Take all that is sent, to the end."""
+        for sent in all_sent:
+            self.receive(sent)
+        self.end()
+        return self
+
     def receive(self, sent: Sent) -> None:
         """Take a frame from a peer, and do what is due by time."""
         self.steady_us += max(sent.received_us - self.now_us, 0)
@@ -242,6 +253,10 @@ class Deaf(Service):
             json.loads(topic.last or b"{}", parse_constant=_refuse)
         if len(self.sent) % 4 == 0:  # it takes as long as an epoch
             assert b"risaf_link" in done(metrics._make())
+
+
+def _peer(sent: tuple[Any, bytes]) -> Any:
+    return sent[0]
 
 
 def _fail(output: Any) -> None:

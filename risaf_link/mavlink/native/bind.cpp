@@ -127,7 +127,7 @@ class EpochFinder {
 
   // The array's next epoch, if frames bring that and nothing else: its time, dt, and the readings of
   // gyros and accelerometers, double. None: they do not. The table is given up.
-  nb::object only(const Cutter& cutter, const nb::bytes& frames, const risaf::ArrayLayout& array,
+  nb::object next(const Cutter& cutter, const nb::bytes& frames, const risaf::ArrayLayout& array,
                   std::int64_t time_us, std::uint16_t sequence) {
     const auto cuts = cutter.frames(frames);
     times_us_.assign(cuts.size(), 0);
@@ -188,6 +188,6 @@ void bind_frames(nb::module_& m) {
       .def("take", &EpochFinder::take, "array"_a, "time_us"_a, "sequence"_a,
            "heard_us"_a, "most"_a)
       .def("single", &EpochFinder::single)
-      .def("only", &EpochFinder::only, "cutter"_a, "frames"_a, "array"_a, "time_us"_a,
+      .def("next", &EpochFinder::next, "cutter"_a, "frames"_a, "array"_a, "time_us"_a,
            "sequence"_a);
 }
