@@ -192,6 +192,11 @@ class Pipeline:
         return [*self.release(), *self._advance(epochs)]
 
     @property
+    def elapsed(self) -> float:
+        """Time of the last epoch, s."""
+        return self._start.estimator.elapsed
+
+    @property
     def may_go_ahead(self) -> bool:
         """Whether nothing but readings bears on the next epoch."""
         calibration, assembler = self._calibration, self.assembler

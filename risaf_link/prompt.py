@@ -2,15 +2,15 @@
 
 Most epochs call for one thing: that their readings go through fusion and filter, and
 ATTITUDE_QUATERNION is sent. That is done as they come. All else takes note of them: counts of links
-and assembler, the guard over headings, notices. For many epochs together it costs a tenth of what
-it costs one by one, so it waits for whatever comes or is due next, and for two beats at most.
+and assembler, the guard over headings, notices, metrics. For many epochs together it costs a tenth
+of what it costs one by one, so it waits for whatever comes or is due next, and for two beats at
+most.
 
 Then the same bytes go the way that all bytes go, through parser, assembler and `Pipeline.advance`,
 as a block of epochs; only that fusion, filter and clock have what they come to already. So nothing
 comes out otherwise than it would, nor later.
 
-Asked for are the kernel, an epoch in datagrams of its own, and a link that is not signed; what is
-to be told to outputs other than links is not told ahead.
+Asked for are the kernel, an epoch in datagrams of its own, and a link that is not signed.
 """
 
 import math
@@ -24,6 +24,9 @@ from risaf_link.mavlink.component import Component
 from risaf_link.mavlink.telemetry import Emitter
 from risaf_link.mavlink.tlog import Stamps
 from risaf_link.pipeline import Pipeline
+from risaf_link.publish.outputs import Outputs
+
+MOST = 32  # epochs that are answered before account of them is taken
 
 
 class Prompt:
@@ -36,25 +39,32 @@ class Prompt:
         Of the pipeline.
     component : Component
         Who listens, and to what.
+    outputs : Outputs
+        Likewise.
+
+    Attributes
+    ----------
+    is_more_due : bool
+        Whether the last epoch calls for more than was answered.
     """
 
-    def __init__(self, pipeline: Pipeline, blocks: BlockReader, component: Component) -> None:
-        self._pipeline, self._blocks, self._component = pipeline, blocks, component
+    def __init__(
+        self, pipeline: Pipeline, blocks: BlockReader, component: Component, outputs: Outputs
+    ) -> None:
+        self._pipeline, self._blocks = pipeline, blocks
+        self._component, self._outputs = component, outputs
+        self.is_more_due = False
         self._answered: list[tuple[list[bytes], int]] = []  # frames, and when they came
         self._left = 0  # epochs that may be answered yet
         self._peers: list[Peer] = []
         self._emitters: list[Emitter] = []
         self._last = 0, 0  # time of the last epoch, us, and its number
-        self._until_us = 0.0
+        self._elapsed = 0.0  # likewise, s, whatever the clocks did
+        self._until_us = self._until_s = 0.0  # these times, from which on more is due
 
     def __bool__(self) -> bool:
         """Whether account of any is still to be taken."""
         return bool(self._answered)
-
-    @property
-    def is_more_due(self) -> bool:
-        """Whether the last epoch calls for more than was answered."""
-        return self._last[0] >= self._until_us
 
     def answer(
         self, frames: list[bytes], received_us: int, peers: list[Peer]
@@ -85,7 +95,9 @@ class Prompt:
         if epoch is None:
             return None
         time_us, dt, readings = epoch
-        if time_us >= self._until_us and not self._answered:  # to take it all at once costs less
+        elapsed = self._elapsed + dt
+        self.is_more_due = time_us >= self._until_us or elapsed >= self._until_s
+        if self.is_more_due and not self._answered:  # to take it all at once costs less
             return None
         ahead = self._pipeline.go_ahead(time_us, received_us, dt, readings)
         if ahead is None:
@@ -93,7 +105,7 @@ class Prompt:
         self._component.note_ahead()
         self._answered.append((frames, received_us))
         self._left -= 1
-        self._last = time_us, (sequence + 1) % 65536
+        self._last, self._elapsed = (time_us, (sequence + 1) % 65536), elapsed
         boot_us, row = ahead
         told = boot_us, *attitude_and_rate(row)
         return [
@@ -117,7 +129,8 @@ class Prompt:
             return
         if last is None or last.sequence is None:
             return
-        self._left = assembler.until_review
-        self._last = last.time_us, last.sequence
+        self._left = min(assembler.until_review, MOST)
+        self._last, self._elapsed = (last.time_us, last.sequence), self._pipeline.elapsed
         self._peers, self._emitters = peers, self._component.emitters(peers)
         self._until_us = min((each.until_us for each in self._emitters), default=math.inf)
+        self._until_s = self._outputs.next_s

@@ -114,7 +114,8 @@ class Service:
         self._recordings = [link for link in self.links if isinstance(link, TlogLink)]
         self._parsers: dict[tuple[str, str], FrameParser] = {}
         self._blocks = BlockReader(self.pipeline.ingest, self.pipeline.assembler, apart=HEARD)
-        self._prompt = Prompt(self.pipeline, self._blocks, self._component)
+        self._outputs = open_outputs(config.mqtt, config.metrics, self.account)
+        self._prompt = Prompt(self.pipeline, self._blocks, self._component, self._outputs)
         self._held = Held()
         self._gibberish = Gibberish()
         self._holding: Peer = ("", "")  # whose datagrams wait
@@ -122,10 +123,10 @@ class Service:
         self._frames = 0
         self._received_us = 0
         self._began_ns = 0  # when that was, on the clock of latencies
+        self._spans_ns: list[tuple[int, int]] = []  # from when to when epochs were answered
         self._frames_in: Counter[str] = Counter()  # by link
         self._frames_out: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()  # from peers that are forgotten
-        self._outputs = open_outputs(config.mqtt, config.metrics, self.account)
         self._mismatch = self._recalled = ""
 
     @property
@@ -191,7 +192,7 @@ class Service:
 
     def _answer(self, frames: list[bytes], sender: Peer) -> bool:
         """Answer an epoch before account is taken of it, if that can be."""
-        if self._outputs.running or sender[0] in self._keys.links:  # they look at each by itself
+        if sender[0] in self._keys.links:  # each frame is looked at by itself
             return False
         if not self._prompt and not self._parser(*sender).is_between_frames:
             return False
@@ -200,6 +201,7 @@ class Service:
             return False
         self._record(frames, self._received_us)
         self._hand_out(answers)
+        self._spans_ns.append((self._began_ns, time.perf_counter_ns()))
         if self._prompt.is_more_due:
             self._take_account()
         return True
@@ -216,7 +218,7 @@ class Service:
         for item in self._blocks.read(table, times_us):
             if not isinstance(item, EpochBlock):
                 raise TypeError("block: found a frame, expected the epochs that were answered")
-            self._send(self.pipeline.advance(item), told=len(item) - self._prompt.is_more_due)
+            self._catch_up(self.pipeline.advance(item))
 
     def _take_held(self) -> None:
         """Take what waits, if anything does."""
@@ -263,16 +265,28 @@ class Service:
         for recording in self._recordings:
             recording.record(received_us, *frames)
 
-    def _send(self, blocks: list[EstimateBlock], told: int = 0) -> None:
-        """Take what came of epochs, and send what is due at all but the first, which are told."""
+    def _send(self, blocks: list[EstimateBlock]) -> None:
+        """Take what came of epochs, and send what is due."""
         for block in blocks:
             peers = self._peers()
             for i, received_us in enumerate(block.received_us.tolist()):
                 estimate = block.at(i)
                 self._component.observe(estimate)
-                if i >= told:
-                    self._hand_out(self._component.emit(estimate, peers))
-                    self._outputs.take(estimate, received_us, self._began_ns)
+                self._hand_out(self._component.emit(estimate, peers))
+                self._outputs.take(estimate, received_us, self._began_ns, time.perf_counter_ns())
+
+    def _catch_up(self, blocks: list[EstimateBlock]) -> None:
+        """Take what came of the epochs that were answered, and send what the last calls for."""
+        spans_ns, self._spans_ns = self._spans_ns, []
+        for block in blocks:
+            for i, (received_us, span_ns) in enumerate(
+                zip(block.received_us.tolist(), spans_ns, strict=True)
+            ):
+                estimate = block.at(i)
+                self._component.observe(estimate)
+                if i == len(block) - 1 and self._prompt.is_more_due:
+                    self._hand_out(self._component.emit(estimate, self._peers()))
+                self._outputs.take(estimate, received_us, *span_ns)
 
     def _peers(self) -> list[Peer]:
         return [(link.name, peer) for link in self.links for peer in link.peers]

@@ -132,7 +132,7 @@ async def test_innovations_and_deviations_are_those_of_the_last_estimate():
     task = asyncio.create_task(metrics.run())
     await until(lambda: metrics.page.port)
     for estimate in estimates():
-        metrics.take(estimate, 0, 0)
+        metrics.take(estimate, 0, 0, 0)
     found = await figures(metrics.page.port)
     task.cancel()
     await asyncio.wait([task])

@@ -77,7 +77,7 @@ async def mosquitto(tmp_path):
 
 def take_all(publisher: MqttPublisher, several) -> None:
     for estimate in several:
-        publisher.take(estimate, 1_700_000_000_000_000 + estimate.time_us, 0)
+        publisher.take(estimate, 1_700_000_000_000_000 + estimate.time_us, 0, 0)
 
 
 def numbers(listener: Listener) -> list[int]:
@@ -107,7 +107,7 @@ class TestWhatIsPublished:
             Listener(mosquitto.port) as listener,
             publishing(parameters(mosquitto.port, rates=all_at_once)) as publisher,
         ):
-            publisher.take(estimate, 77, 0)
+            publisher.take(estimate, 77, 0, 0)
             publisher.tell(Notice(Severity.WARNING, "GPS lost"), 5, 6)
             await until(lambda: listener.count == 6)
         (attitude,), (heading,) = listener.of("attitude"), listener.of("heading")
@@ -138,7 +138,7 @@ class TestWhatIsPublished:
             Listener(mosquitto.port) as listener,
             publishing(parameters(mosquitto.port)) as publisher,
         ):
-            publisher.take(first, 0, 0)
+            publisher.take(first, 0, 0, 0)
             await until(lambda: listener.of("heading") and listener.of("attitude"))
         (heading,), (attitude,) = listener.of("heading"), listener.of("attitude")
         assert (attitude["yaw_rad"] is None) == (not first.attitude.aligned)
@@ -278,7 +278,7 @@ class TestTheServiceGoesOn:
             proxy.flowing.clear()
             while not publisher.counts().dropped["sensors"]:
                 last = next(several)
-                publisher.take(last, 0, 0)
+                publisher.take(last, 0, 0, 0)
                 for _ in range(50):  # turns in which it may go out
                     await asyncio.sleep(0)
             assert publisher.counts().published["sensors"] > 5  # until all buffers were full

@@ -201,6 +201,39 @@ def test_another_filter_takes_every_epoch_as_it_comes():
     assert_same(prompt, usual)
 
 
+def test_outputs_are_told_the_same():
+    rates = "rates: {attitude: 5, heading: 2, array: 1, sensors: 0.5}"
+    settings = "metrics.listen=127.0.0.1:1", f"mqtt={{url: 'mqtt://nobody', {rates}}}"
+    stations = Station(*settings), Station(*settings, prompt=False)
+    published = [watch_mqtt(station) for station in stations]
+    for event in drive("circle", 4.0, sensors=100):
+        for station in stations:
+            station.give(*event)
+    for station in stations:
+        station.end()
+        metrics, _ = station.service._outputs.running
+        assert sum(metrics._latencies._counts) == len(station.estimates)
+    assert stations[0].answered > 200
+    assert len(published[0]) > 30
+    assert published[0] == published[1]
+    assert_same(*stations)
+
+
+def watch_mqtt(station):
+    """What is published from now on, and when."""
+    _, mqtt = station.service._outputs.running
+    published, take = [], mqtt.take
+
+    def watched(*told):
+        take(*told)
+        for topic in mqtt._topics:
+            published.extend((station.now_s, topic.name, payload) for payload in topic.waiting)
+            topic.waiting.clear()
+
+    mqtt.take = watched
+    return published
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_whatever_comes_in_between(seed):
     """Garbage, cut datagrams, other arrays, orders, and silence, each at any moment."""

@@ -84,6 +84,8 @@ class Metrics:
     page : Page
     """
 
+    next_s = math.inf  # who reads the page reads what is known by then
+
     def __init__(
         self,
         parameters: MetricsParameters,
@@ -102,9 +104,9 @@ class Metrics:
         self._began_ns = 0  # of that estimate
         self._process = ProcessCollector(registry=None)
 
-    def take(self, estimate: Estimate, received_us: int, began_ns: int) -> None:  # noqa: ARG002
+    def take(self, estimate: Estimate, received_us: int, began_ns: int, done_ns: int) -> None:  # noqa: ARG002
         """Take the next estimate, and count its latency."""
-        self._latencies.note(time.perf_counter_ns() - began_ns)
+        self._latencies.note(done_ns - began_ns)
         self._estimate, self._began_ns = estimate, began_ns
 
     def tell(self, notice: Notice, time_us: int, unix_us: int) -> None:  # noqa: ARG002

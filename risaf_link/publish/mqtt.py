@@ -111,7 +111,7 @@ class MqttPublisher:
             for name, make in topics.STATES.items()
             if getattr(p.rates, name) > 0
         ]
-        self._next_s = 0.0 if self._topics else math.inf  # when the first of them is due
+        self.next_s = 0.0 if self._topics else math.inf  # when the first of them is due
         self._events: deque[bytes] = deque()
         self._told = 0
         self._events_published = self._events_dropped = 0
@@ -137,16 +137,16 @@ class MqttPublisher:
 
     # In
 
-    def take(self, estimate: Estimate, received_us: int, began_ns: int) -> None:  # noqa: ARG002
+    def take(self, estimate: Estimate, received_us: int, began_ns: int, done_ns: int) -> None:  # noqa: ARG002
         """Take the next estimate: let those topics wait that are due."""
         elapsed = estimate.elapsed
-        if elapsed < self._next_s:
+        if elapsed < self.next_s:
             return
         for topic in self._topics:
             if elapsed >= topic.due_s:
                 topic.due_s = (math.floor(elapsed * topic.rate) + 1) / topic.rate
                 topic.put(topics.encode(topic.make(estimate, received_us)))
-        self._next_s = min(topic.due_s for topic in self._topics)
+        self.next_s = min(topic.due_s for topic in self._topics)
         self._has_states.set()
 
     def tell(self, notice: Notice, time_us: int, unix_us: int) -> None:

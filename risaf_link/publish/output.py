@@ -12,9 +12,17 @@ class Output(Protocol):
     `take` and `tell` are called between one epoch and the next, when the epoch's own frames have
     been handed out. They must not wait, and must cost next to nothing where nothing is due; what
     takes its time is done by `run`.
+
+    Attributes
+    ----------
+    next_s : float
+        From which time of an estimate, `elapsed`, on one is to be taken without delay. Those before
+        it may come some epochs later, together.
     """
 
-    def take(self, estimate: Estimate, received_us: int, began_ns: int) -> None:
+    next_s: float
+
+    def take(self, estimate: Estimate, received_us: int, began_ns: int, done_ns: int) -> None:
         """Take the next estimate.
 
         Parameters
@@ -22,8 +30,8 @@ class Output(Protocol):
         estimate : Estimate
         received_us : int
             When what made it possible came, microseconds since 1970.
-        began_ns : int
-            The same instant on `time.perf_counter_ns`.
+        began_ns, done_ns : int
+            The same instant on `time.perf_counter_ns`, and when its frames had been handed out.
         """
 
     def tell(self, notice: Notice, time_us: int, unix_us: int) -> None:

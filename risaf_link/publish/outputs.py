@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable
 
 from risaf_link.core.estimate import Estimate
@@ -31,11 +32,16 @@ class Outputs:
     def __init__(self, outputs: list[Output]) -> None:
         self.running = outputs
 
-    def take(self, estimate: Estimate, received_us: int, began_ns: int) -> None:
+    @property
+    def next_s(self) -> float:
+        """From which time of an estimate on one is to be taken without delay."""
+        return min((output.next_s for output in self.running), default=math.inf)
+
+    def take(self, estimate: Estimate, received_us: int, began_ns: int, done_ns: int) -> None:
         """Take the next estimate, as `Output.take` does."""
         for output in self.running:
             try:
-                output.take(estimate, received_us, began_ns)
+                output.take(estimate, received_us, began_ns, done_ns)
             except Exception:
                 self._leave_out(output)
 

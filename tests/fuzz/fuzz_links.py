@@ -167,17 +167,16 @@ def _check_parameters(network: Network) -> None:
 def service(data: bytes) -> None:
     """Whatever is sent to the service, all that it says is sound, and a replay says the same."""
     base = configs()[data[0] % len(configs()) if data else 0]
-    outputs: dict[str, Any] = {}
-    if data[:1] >= b"\x80":  # with them, no epoch is answered before account is taken of it
-        outputs["mqtt"] = MqttParameters("mqtt://nobody", rates=MqttRates(50, 50, 50, 50))
-        outputs["metrics"] = MetricsParameters("127.0.0.1:1")
+    hertz = data[-1] % 51 if data else 0
+    outputs = {"mqtt": MqttParameters("mqtt://nobody", rates=MqttRates(*[hertz] * 4))}
+    outputs |= {"metrics": MetricsParameters("127.0.0.1:1")}
     config = structs.replace(base, emit=dict.fromkeys(EMITTED.values(), 8.0), **outputs)
     all_sent = list(messages(data[1:]))
     running = Deaf(config).given(all_sent)
-    if not outputs:
-        usual = Deaf(config, prompt=False).given(all_sent)
-        assert sorted(usual.sent, key=_peer) == sorted(running.sent, key=_peer)
-        assert usual.account() == running.account()
+    usual = Deaf(config, prompt=False).given(all_sent)
+    assert sorted(usual.sent, key=_peer) == sorted(running.sent, key=_peer)
+    assert usual.account() == running.account()
+    assert usual.published() == running.published()
     _check_replay(config, running.recorded, running.tracks)
     last: dict[Any, int] = {}
     for (peer, raw), message in zip(
@@ -217,11 +216,18 @@ class Deaf(Service):
     def _hand_out(self, frames: list[tuple[Any, bytes]]) -> None:
         self.sent += frames
 
-    def _send(self, blocks: list[EstimateBlock], told: int = 0) -> None:
+    def _send(self, blocks: list[EstimateBlock]) -> None:
+        self._look(blocks)
+        super()._send(blocks)
+
+    def _catch_up(self, blocks: list[EstimateBlock]) -> None:
+        self._look(blocks)
+        super()._catch_up(blocks)
+
+    def _look(self, blocks: list[EstimateBlock]) -> None:
         for block in blocks:
             check_estimates(block)
             self.tracks.append(block.track.values.tobytes())
-        super()._send(blocks, told)
 
     def given(self, all_sent: list[Sent]) -> "Deaf":
         """Take all that is sent, to the end."""
@@ -241,16 +247,18 @@ class Deaf(Service):
             self._component.advance(self.steady_us, self.now_us)
             self._hand_out(self._component.collect(PEERS))
 
+    def published(self) -> list[bytes]:
+        """What was last told over MQTT."""
+        _, mqtt = self._outputs.running
+        return [topic.last for topic in mqtt._topics]
+
     def end(self) -> None:
         """Do what is done at the end."""
         self._take_held()
         self._send(self.pipeline.flush(self.now_us))
-        outputs = self._outputs.running
-        if not outputs:
-            return
-        mqtt, metrics = sorted(outputs, key=lambda each: type(each).__name__, reverse=True)
-        for topic in mqtt._topics:
-            json.loads(topic.last or b"{}", parse_constant=_refuse)
+        for payload in self.published():
+            json.loads(payload or b"{}", parse_constant=_refuse)
+        metrics, _ = self._outputs.running
         if len(self.sent) % 4 == 0:  # it takes as long as an epoch
             assert b"risaf_link" in done(metrics._make())
 
