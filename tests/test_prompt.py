@@ -10,6 +10,7 @@ from risaf_link.config import load
 from risaf_link.core.compiled import native
 from risaf_link.mavlink.dialect import IDS
 from risaf_link.mavlink.frame import FrameParser, encode
+from risaf_link.mavlink.held import MESSAGE_ID
 from risaf_link.service import Service
 from risaf_link.sim.scenario import scenario
 
@@ -161,6 +162,16 @@ def test_the_same_is_told_at_the_same_time(name, how):
     prompt, usual = both(drive(name, how=how, sensors=100))
     assert prompt.answered > (0 if how == "shuffled" else 100)
     assert len(prompt.told) > 300
+    assert_same(prompt, usual)
+
+
+def test_attitude_is_told_first_whatever_the_order_of_rates():
+    late = "emit: {ARRAY_STATUS: 10, ATTITUDE_QUATERNION: 10, GPS_HEADING_STATUS: 10}"
+    links = LINKS.replace("emit: {ATTITUDE_QUATERNION: 50}", late)
+    prompt, usual = both(drive("circle", 3.0, sensors=100), links)
+    assert prompt.answered > 200
+    told = [int.from_bytes(raw[MESSAGE_ID], "little") for *_, raw in prompt.told]
+    assert told.index(IDS["ATTITUDE_QUATERNION"]) < told.index(IDS["ARRAY_STATUS"])
     assert_same(prompt, usual)
 
 
