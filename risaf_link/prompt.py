@@ -122,15 +122,12 @@ class Prompt:
 
     def _prepare(self, peers: list[Peer]) -> None:
         """See what the next epochs may call for."""
-        assembler = self._pipeline.assembler
-        last = assembler.last
+        last = self._blocks.last
         self._left = 0
-        if not (self._blocks.is_steady and self._pipeline.may_go_ahead):
+        if last is None or not self._pipeline.may_go_ahead:
             return
-        if last is None or last.sequence is None:
-            return
-        self._left = min(assembler.until_review, MOST)
-        self._last, self._elapsed = (last.time_us, last.sequence), self._pipeline.elapsed
+        self._left = min(self._pipeline.assembler.until_review, MOST)
+        self._last, self._elapsed = last, self._pipeline.elapsed
         self._peers, self._emitters = peers, self._component.emitters(peers)
         self._until_us = min((each.until_us for each in self._emitters), default=math.inf)
         self._until_s = self._outputs.next_s

@@ -180,8 +180,7 @@ class Service:
             self._holding = sender
         if self._held.holds(data):
             return Worth.UNKNOWN
-        self._began_ns = time.perf_counter_ns()
-        self._received_us = self._clock_us() & ~3  # as a recording keeps it
+        self._note_arrival()
         if self._held.is_whole and self._answer([*self._held.parts, data], sender):
             self._held.take()
             return Worth.SAMPLES
@@ -224,9 +223,13 @@ class Service:
         """Take what waits, if anything does."""
         self._take_account()
         if self._held:
-            self._began_ns = time.perf_counter_ns()
-            self._received_us = self._clock_us() & ~3
+            self._note_arrival()
             self._take(self._held.take(), self._holding)
+
+    def _note_arrival(self) -> None:
+        """Take note that what is taken next has come now."""
+        self._began_ns = time.perf_counter_ns()
+        self._received_us = self._clock_us() & ~3  # as a recording keeps it
 
     def _take(self, data: bytes, sender: Peer) -> Worth:
         before_us, received_us = self.pipeline.ingest.heard_us, self._received_us

@@ -143,6 +143,14 @@ class BlockReader:
                 self._lay_out(source, info)
         return self._steady
 
+    @property
+    def last(self) -> tuple[int, int] | None:
+        """Time, us, and number of the epoch on which the next may follow at once; None: none."""
+        last = self._assembler.last
+        if not self.is_steady or last is None or last.sequence is None:
+            return None
+        return last.time_us, last.sequence
+
     def next(self, frames: bytes, time_us: int, sequence: int) -> tuple[int, float, bytes] | None:
         """Read the next epoch alone, without taking it.
 
@@ -164,14 +172,12 @@ class BlockReader:
         return self._finder.next(cutter, frames, self._layout, time_us, sequence)
 
     def _block(self, table: FrameTable, most: int) -> RegularEpochs | None:
-        last = self._assembler.last
-        if self._finder is None or not self.is_steady or self._laid_out is None:
-            return None
-        if last is None or last.sequence is None:
+        last = self.last
+        if self._finder is None or last is None or self._laid_out is None:
             return None
         source, info, gyros, forces = self._laid_out
         heard_us = self._ingest.heard_us
-        found = self._finder.take(self._layout, last.time_us, last.sequence, heard_us, most)
+        found = self._finder.take(self._layout, *last, heard_us, most)
         if found is None:
             return None
         size, values, came_us, last_row, sequence, unusable, refused, asides = found

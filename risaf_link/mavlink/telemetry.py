@@ -53,10 +53,11 @@ ESTIMATOR_ATTITUDE, ESTIMATOR_GPS_GLITCH = 1, 1024  # ESTIMATOR_STATUS_FLAGS
 UINT32_LIMIT = 2**32 - 1
 ROUNDED_US = 1000  # more than the end of a period can be off by
 
-_ATTITUDE = writer(
-    *("ATTITUDE_QUATERNION", "time_boot_ms", "q1", "q2", "q3", "q4"),
+_ATTITUDE_FIELDS = (
+    *("time_boot_ms", "q1", "q2", "q3", "q4"),
     *("rollspeed", "pitchspeed", "yawspeed"),
 )
+_write_attitude = writer(ATTITUDE, *_ATTITUDE_FIELDS)
 
 
 class ComponentState(IntEnum):
@@ -103,7 +104,6 @@ class Emitter:
         self.profile = profile
         self._signing = signing
         self._asked: dict[Message, float] = {}  # Hz, 0: none
-        self._rates = self._sent = rates
         self.set_defaults(rates)
         self._component = component
         self._sequence = 0
@@ -157,7 +157,7 @@ class Emitter:
         rate = self._sent.get(ATTITUDE)
         if rate is None or not self._is_due(ATTITUDE, rate, time_us):
             return []
-        return [self._frame(*_ATTITUDE(_boot_ms(boot_us), *attitude))]
+        return [self._frame(*_write_attitude(_boot_ms(boot_us), *attitude))]
 
     def _is_due(self, name: Message, rate: float, time_us: int) -> bool:
         """Whether a message is due at an epoch; if so, it is taken for sent."""
@@ -231,19 +231,9 @@ def _boot_ms(boot_us: int) -> int:
 
 def _attitude_quaternion(estimate: Estimate) -> dict[str, Any]:
     attitude = estimate.attitude
-    w, x, y, z = attitude.q_nb.tolist()
-    roll, pitch, yaw = attitude.rate_b.tolist()
-    return {
-        "time_boot_ms": _boot_ms(estimate.boot_us),
-        "q1": w,
-        "q2": x,
-        "q3": y,
-        "q4": z,
-        "rollspeed": roll,
-        "pitchspeed": pitch,
-        "yawspeed": yaw,
-        "repr_offset_q": (0.0, 0.0, 0.0, 0.0),
-    }
+    told = _boot_ms(estimate.boot_us), *attitude.q_nb.tolist(), *attitude.rate_b.tolist()
+    fields = dict(zip(_ATTITUDE_FIELDS, told, strict=True))
+    return {**fields, "repr_offset_q": (0.0, 0.0, 0.0, 0.0)}
 
 
 def _attitude_quaternion_cov(estimate: Estimate) -> dict[str, Any]:
